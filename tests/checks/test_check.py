@@ -14,6 +14,7 @@ from unbake.checks.check import check_data
 from unbake.checks.pictures import PictureFacts, blurred, percentage, picture_facts
 from unbake.checks.told import ROWS, told_rows
 from unbake.dataset import alignment as aligning
+from unbake.dataset import quick_check
 from unbake.dataset.agreement import exposures, shared_points, turning_light
 from unbake.dataset.camera import Camera
 from unbake.dataset.findings import Check, misaligned
@@ -295,7 +296,8 @@ def test_a_mesh_with_y_up_and_in_centimetres_is_told(spoilt):
     data.poses(changed)
     (finding,) = found(data.save(), "alignment")
     assert "in other units and of a world with z up: " in finding.what
-    assert finding.remedy.endswith("; or the mesh: import --mesh-scale 0.01 --mesh-y-up")
+    told = "; or the mesh: import --mesh-scale 0.01 --mesh-y-up; if it had that already, keep it"
+    assert told in finding.remedy
 
 
 def test_masks_that_were_drawn_by_wrong_poses_do_not_confirm_them(spoilt):
@@ -361,6 +363,16 @@ def test_what_masks_hide_is_not_seen(spoilt):
     result = check_data(data.save())
     assert result.coverage[0] > whole[0] + 0.2
     assert any("is seen by no training view" in f.what for f in result.findings)
+
+
+def test_nothing_seen_but_a_ground_is_an_error(spoilt, monkeypatch):
+    data = spoilt("still")
+    monkeypatch.setattr("unbake.checks.check.view_counts", lambda *_, **__: np.zeros(100, int))
+    result = check_data(data.save())
+    (finding,) = [f for f in result.findings if f.check == "coverage"]
+    assert finding.level == "error" and not result.usable
+    assert finding.what == "no training view sees anything of the scene, but a ground beneath it"
+    assert "upside down" in finding.remedy
 
 
 def test_masked_pixels_say_nothing_of_poses(spoilt, monkeypatch):
@@ -673,6 +685,9 @@ def test_of_poses_with_the_same_edges_those_count_that_cover_a_cut_out(cut_out, 
     monkeypatch.setattr(aligning, "photograph_edges", lambda view: view.rgb[..., 0])
     monkeypatch.setattr(aligning, "drawn_edges", drawn)
     monkeypatch.setattr(aligning, "_likely", lambda scene, views: [wrong, right])
+    monkeypatch.setattr(
+        aligning, "_surface_seen", lambda scene, cameras, others: [1.0] * len(others)
+    )
     found = aligning.alignment(None, views)
     assert found.mistake is (right if cut_out else wrong)
     assert found.best == pytest.approx(1)
@@ -699,8 +714,80 @@ def test_no_pose_that_covers_less_is_better(monkeypatch):
     monkeypatch.setattr(aligning, "photograph_edges", lambda view: view.rgb[..., 0])
     monkeypatch.setattr(aligning, "drawn_edges", drawn)
     monkeypatch.setattr(aligning, "_likely", lambda scene, views: [Mistake(("turned",))])
+    monkeypatch.setattr(
+        aligning, "_surface_seen", lambda scene, cameras, others: [1.0] * len(others)
+    )
     found = aligning.alignment(None, views)
     assert found.mistake is None and found.share == pytest.approx(0.5)
+
+
+def of_a_table(turn):
+    """A table of the ground's colour, which shows the ground's outline alone, z up.
+
+    Args:
+        turn: of the poses, (3, 3).
+
+    Returns:
+        The scene, and small views of it.
+    """
+    ground = mi.ScalarTransform4f().scale(2)
+    top = mi.ScalarTransform4f().translate([0.1, 0.2, 0.7]).scale([0.6, 0.4, 0.05])
+    leg = mi.ScalarTransform4f().translate([0.1, 0.2, 0.33]).scale([0.1, 0.1, 0.32])
+    wood = {"type": "twosided", "sides": {"type": "principled"}}
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "ground": {"type": "rectangle", "to_world": ground, "wood": wood},
+            "top": {"type": "cube", "to_world": top, "wood": wood},
+            "leg": {"type": "cube", "to_world": leg, "wood": wood},
+        },
+        optimize=False,  # it joins meshes
+    )
+    angles = np.linspace(0, 2 * np.pi, 8, endpoint=False)
+    places = [(5 * np.cos(a), 5 * np.sin(a), 3 + 2 * (i % 2)) for i, a in enumerate(angles)]
+    cameras = [Camera.look_at(p, (0, 0, 0.3), (0, 0, 1), 50.0, 48, 48) for p in places]
+    views = []
+    for i, (camera, seen) in enumerate(zip(cameras, seen_by(scene, cameras), strict=True)):
+        hit = np.isfinite(seen.distance)
+        shade = 0.5 * hit * np.where(seen.position[:, 2] > 0.01, 0.97, 1)
+        rgb = np.repeat(shade[:, None], 3, 1).astype(np.float32)
+        pose = np.eye(4)
+        pose[:3, :3] = turn
+        posed = replace(camera, to_world=pose @ camera.to_world)
+        view = small_view(str(i), posed, rgb, hit.astype(np.float32))
+        views.append(replace(view, of_mesh=True))
+    return scene, views
+
+
+def test_a_ground_that_hides_what_stands_on_it_is_not_taken_for_better():
+    """From below its outline is all there is, as in photographs whose table is of its colour."""
+    lying, over = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), np.diag([1.0, -1, -1])
+    found = {}
+    for name, turn in (("right", np.eye(3)), ("lying", lying), ("under", over)):
+        scene, views = of_a_table(turn)
+        found[name] = aligning.alignment(scene, views)
+    assert found["under"].score > found["right"].score + aligning.MARGIN, "edges alone mislead"
+    assert found["right"].best is None
+    for name in ("lying", "under"):
+        assert found[name].best == pytest.approx(found["right"].score, abs=0.02)
+        finding = misaligned(found[name])
+        assert finding.level == "error"
+        assert ("nearly nothing but the ground" in finding.what) == (name == "under")
+    assert "of a world with y up" in misaligned(found["lying"]).what
+    assert np.array_equal(found["under"].mistake.turn, over)
+
+
+def test_a_fit_doubts_poses_by_shapes_that_are_not_merged(captured, monkeypatch):
+    """A ground that is merged with what stands on it cannot be told from that."""
+    dataset = Dataset.load(captured("still"))
+    scene = parse(dataset.scene, dataset.root).instantiate()
+    photographs, apart = Photographs.load(dataset, False), object()
+    right = aligning.Alignment(8, 0.4, 0.5)
+    wrong = replace(right, mistake=Mistake(("turned (turn them)",)), best=0.6)
+    monkeypatch.setattr(quick_check, "compared", lambda of, *_: right if of is apart else wrong)
+    words = (scene, dataset.train, photographs)
+    assert [finding.check for finding in quick_findings(*words)] == ["alignment"]
+    assert quick_findings(*words, lambda: apart) == []
 
 
 def test_a_background_that_jpeg_made_nearly_black_hides_no_edges():

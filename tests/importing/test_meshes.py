@@ -18,6 +18,7 @@ from unbake.importing.faults import Faults, ImportFaults
 from unbake.importing.import_data import import_data
 from unbake.importing.meshes import TO_Z_UP, Part, check_place, read_parts, write_scene
 from unbake.importing.settings import ImportSettings
+from unbake.importing.world import read_matrix
 from unbake.scene.edit import material_names
 from unbake.scene.parse import parse
 
@@ -336,18 +337,26 @@ def test_what_is_told_of_the_mesh_cures_as_much_as_other_poses(mistake, captured
         assert not options
         return
     assert options.endswith(")") and told.count("import") == 1
+    plain, _, otherwise = options.removesuffix(")").partition("; if it ")
     points = np.random.default_rng(0).normal(size=(20, 3))
-    moved = points
-    if "without --mesh-y-up" in options:
-        moved = moved @ TO_Z_UP[:3, :3]  # back
-    elif "--mesh-y-up" in options:
-        moved = moved @ TO_Z_UP[:3, :3].T
-    if "--mesh-scale" in options:
-        moved = moved * float(options.partition("--mesh-scale ")[2].rstrip(")").split()[0])
-    here, there = (
-        (at - c.origin) @ c.to_world[:3, :3] for at, c in ((moved, camera), (points, corrected))
-    )
-    assert np.allclose(mistake.scale * here, there, rtol=1e-4, atol=1e-4 * mistake.scale)
+    to_z_up = TO_Z_UP[:3, :3]
+    # As the mesh was imported, and is to be: each with --mesh-y-up, or without.
+    before, after = {
+        "without --mesh-y-up": (to_z_up, np.eye(3)),
+        "--mesh-y-up": (np.eye(3), to_z_up),
+    }.get(plain.partition("--mesh-scale ")[2].partition(" ")[2] or plain, (np.eye(3),) * 2)
+    scale = float(plain.partition("--mesh-scale ")[2].partition(" ")[0] or 1)
+    ways = [after @ before.T]
+    if otherwise:
+        ways.append(read_matrix(otherwise.partition("--mesh-matrix ")[2].split())[:3, :3])
+        was = "was without, add" if "without" in plain else "had that already, keep it and add"
+        assert otherwise.startswith(f"{was} --mesh-matrix ")
+    for way in ways:
+        moved = scale * points @ way.T
+        here, there = (
+            (at - c.origin) @ c.to_world[:3, :3] for at, c in ((moved, camera), (points, corrected))
+        )
+        assert np.allclose(mistake.scale * here, there, rtol=1e-4, atol=1e-4 * mistake.scale)
 
 
 def with_corner(matrix):

@@ -51,8 +51,8 @@ Item = TypeVar("Item")
 _CLIPPED, _CLIPPED_IN_ALL, _CLIPPED_AND_TOLD = 0.05, 0.01, 0.25
 #: The same of black pixels.
 _BLACK, _BLACK_IN_ALL = 0.6, 0.3
-#: Share of the surface that no view sees, above which it is told.
-_UNSEEN = 0.3
+#: Share of the surface that no view sees, above which it is told, and above which poses are wrong.
+_UNSEEN, _ALL_UNSEEN = 0.3, 0.99
 #: Share of the surface whose normals may be turned away from it.
 _TURNED = 0.05
 #: Cameras farther away than so many diagonals of the scene are doubtful.
@@ -214,7 +214,11 @@ def _check_dataset(
         return  # with such poses, what views share and see is something else
     _check_light(result)
     result.coverage = _coverage(scene, train, hidden=dataset.background == "hidden")
-    if result.coverage is not None and result.coverage[0] > _UNSEEN:
+    if result.coverage is not None and result.coverage[0] > _ALL_UNSEEN:
+        what = "no training view sees anything of the scene, but a ground beneath it"
+        remedy = "Check the axes of the poses and of the mesh: one of both may be upside down"
+        result.add(Finding("error", "coverage", what, None, remedy))
+    elif result.coverage is not None and result.coverage[0] > _UNSEEN:
         what = f"{100 * result.coverage[0]:.0f} % of the surface is seen by no training view"
         remedy = "What no photograph shows is guessed: take more, or accept that"
         result.warn("coverage", what, None, remedy)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import mitsuba as mi
 import numpy as np
 
+from ..scene import free_space
 from .camera import Camera
 from .mistakes import Mistake, all_mistakes
 from .small_views import SmallView, seen_by, small_view, view_rays
@@ -28,6 +29,11 @@ _FEW_VIEWS, _LIKELY = 4, 20
 #: And that sees surface in so many fewer of the pixels that show some, at most: a cut-out tells
 #: two poses apart that have much the same edges.
 _UNCOVERED = 0.03
+#: Poses of nearly as good a score, that see less than this share of the surface that others see, do
+#: not count: from below, a ground has much the same edges, and hides all that stands on it.
+_ALIKE, _HARDLY = 0.15, 0.1
+#: The share of the surface below which poses as they are may be such, and points that tell it.
+_UNSEEN, _POINTS = 0.02, 512
 #: The mesh may be turned about its own centre if that is so many of its diagonals from the origin.
 _OFF_ORIGIN = 0.02
 #: Relative jump of inverse depth, and jump of normals, that are a whole edge.
@@ -56,6 +62,8 @@ class Alignment:
         elsewhere: share of the photographs that agree with poses of others, if most of them do
             clearly better than with their own.
         focal: factor of focal lengths with which edges agree clearly better.
+        unseen: whether that is told by the surface: with the poses as they are nearly none is seen
+            but for a ground, and edges agree about as well without the mistake.
     """
 
     views: int
@@ -67,6 +75,7 @@ class Alignment:
     best_share: float | None = None
     elsewhere: float | None = None
     focal: float | None = None
+    unseen: bool = False
 
 
 def alignment(scene: mi.Scene, views: Sequence[SmallView]) -> Alignment | None:
@@ -87,8 +96,9 @@ def alignment(scene: mi.Scene, views: Sequence[SmallView]) -> Alignment | None:
     mistakes = _likely(scene, views)
     shown = [view.alpha > 0.5 for view in views]
     (drawn, hits), *others = drawn_edges(scene, cameras, [Mistake(()), *mistakes])
-    given, share = edge_scores(edges, drawn), _share(hits)
-    result = Alignment(len(views), float(given.mean()), share)
+    share = _share(hits)
+    own = _Other(edge_scores(edges, drawn), _share(hits, shown), share)
+    result = Alignment(len(views), own.score, share)
     tried: list[_Other] = []
     for told, axis in _MIRRORED.items():
         mirrored = [np.flip(e, axis) for e in edges]
@@ -97,23 +107,27 @@ def alignment(scene: mi.Scene, views: Sequence[SmallView]) -> Alignment | None:
     for mistake, (found, seen) in zip(mistakes, others, strict=True):
         scores, covered = edge_scores(edges, found), _share(seen, shown)
         tried.append(_Other(scores, covered, _share(seen), mistake))
-    better = [other for other in tried if _clearly_better(other.scores, given)]
+    better = [other for other in tried if _clearly_better(other.scores, own.scores)]
+    unseen = not better
+    if unseen:
+        better = _that_see_more(scene, cameras, own, tried)
+    elif cut_out(views):
+        # Poses as they are may cover more of what is shown than any others
+        most = max(own.covered, *(other.covered for other in better))
+        better = [other for other in better if other.covered >= most - _UNCOVERED]
+    if not unseen:
+        better = _that_see(scene, cameras, own, better)
     if not better:
         return result
-    if cut_out(views):
-        # Poses as they are may cover more of what is shown than any others
-        most = max(_share(hits, shown), *(other.covered for other in better))
-        better = [other for other in better if other.covered >= most - _UNCOVERED]
-        if not better:
-            return result
-    top = max(other.scores.mean() for other in better)
-    best = next(other for other in better if other.scores.mean() >= top - _NEARLY)
+    top = max(other.score for other in better)
+    best = next(other for other in better if other.score >= top - _NEARLY)
     return replace(
         result,
         mistake=best.mistake,
         mirrored=best.mirrored,
-        best=float(best.scores.mean()),
+        best=best.score,
         best_share=best.share,
+        unseen=unseen,
     )
 
 
@@ -145,6 +159,73 @@ class _Other:
     share: float
     mistake: Mistake | None = None
     mirrored: str | None = None
+
+    @property
+    def score(self) -> float:
+        """The mean score."""
+        return float(self.scores.mean())
+
+
+def _that_see(
+    scene: mi.Scene, cameras: Sequence[Camera], own: _Other, better: Sequence[_Other]
+) -> list[_Other]:
+    """Those of the better poses that do not see far less of the surface than others as good.
+
+    Args:
+        scene: that the photographs show.
+        cameras: with the poses as they are.
+        own: these.
+        better: others, of clearly better scores.
+    """
+    if not better:
+        return []
+    least = max(other.score for other in better) - _ALIKE
+    alike = [other for other in (own, *better) if other.score >= least]
+    shares = _surface_seen(scene, cameras, alike)
+    hardly = {id(o) for o, s in zip(alike, shares, strict=True) if s < _HARDLY * max(shares)}
+    return [other for other in better if id(other) not in hardly]
+
+
+def _that_see_more(
+    scene: mi.Scene, cameras: Sequence[Camera], own: _Other, tried: Sequence[_Other]
+) -> list[_Other]:
+    """Poses of much the same score, where poses as they are see nearly nothing but a ground.
+
+    Args:
+        scene: that the photographs show.
+        cameras: with the poses as they are.
+        own: these.
+        tried: others.
+    """
+    (least,) = _surface_seen(scene, cameras, [own])
+    alike = [other for other in tried if other.score > max(LEAST, own.score - _ALIKE)]
+    if least >= _UNSEEN or not alike:
+        return []
+    shares = _surface_seen(scene, cameras, alike)
+    most = max(shares)
+    if least >= _HARDLY * most:
+        return []
+    return [other for other, share in zip(alike, shares, strict=True) if share >= _HARDLY * most]
+
+
+def _surface_seen(
+    scene: mi.Scene, cameras: Sequence[Camera], others: Sequence[_Other]
+) -> list[float]:
+    """The share of the surface but for its ground that cameras see, of each of the poses."""
+    low, high, _ = free_space.extent(scene, lamps=False)
+    points = free_space.sample_surface(scene, _POINTS, 0, within=(low, high))
+    if not len(points.position):
+        return [1.0] * len(others)
+    found = []
+    for other in others:
+        seen = np.zeros(len(points.position), dtype=bool)
+        for given in cameras:
+            camera = given if other.mistake is None else other.mistake.corrected(given)
+            framed = np.flatnonzero(~seen & (camera.pixel_of(points.position) >= 0))
+            shown = free_space.visibility(scene, camera.origin[None], points.of(framed))
+            seen[framed] = shown[0]
+        found.append(float(seen.mean()))
+    return found
 
 
 def _share(hits: Sequence[np.ndarray], shown: Sequence[np.ndarray] | None = None) -> float:

@@ -96,12 +96,15 @@ def misaligned(found: Alignment | None) -> Finding | None:
     what = f"poses seem to be {found.mistake.parts[0].partition(' (')[0]}"
     for part in found.mistake.parts[1:]:
         what += f" and {part.partition(' (')[0]}"
+    what += f": {much} {found.best:.2f}"
+    if found.unseen:
+        what += ". As they are, views see nearly nothing but the ground"
     remedies = [part.partition(" (")[2].removesuffix(")") for part in found.mistake.parts]
     remedy = ", and ".join(remedies)
     return Finding(
         "error",
         "alignment",
-        f"{what}: {much} {found.best:.2f}",
+        what,
         None,
         f"{remedy[0].upper()}{remedy[1:]}",
     )

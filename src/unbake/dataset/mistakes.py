@@ -27,8 +27,12 @@ _TURNS = {
         np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     ),
 }
-#: What turns the mesh of an import instead, in the same order.
-_TURNS_OF_MESH = ("--mesh-y-up", "without --mesh-y-up")
+#: What turns the mesh of an import instead, in the same order: an option, and what else does where
+#: the mesh was imported with it, or without. A data set does not tell which of both it was.
+_TURNS_OF_MESH = (
+    ("--mesh-y-up", "if it had that already, keep it and add"),
+    ("without --mesh-y-up", "if it was without, add"),
+)
 _INVERTED = "from world to camera (invert the matrices)"
 #: Units that are taken for each other: millimetres, centimetres, inches, decimetres, metres.
 UNITS = (0.001, 0.01, 0.0254, 0.1, 10.0, 1 / 0.0254, 100.0, 1000.0)
@@ -137,15 +141,13 @@ def _simplest_first(
 def _or_the_mesh(parts: tuple[str, ...], scale: float, turn: np.ndarray) -> tuple[str, ...]:
     """The phrases, the last of which also says how to import the mesh for poses as they are."""
     known = zip(_TURNS.values(), _TURNS_OF_MESH, strict=True)
-    options = [told for other, told in known if np.array_equal(turn, other)]
-    back = np.eye(4)
-    back[:3, :3] = turn.T
-    if not options and not np.array_equal(turn, np.eye(3)):
-        options = [_as_words(back)]
-    elif options == [_TURNS_OF_MESH[1]] and scale == 1:  # the mesh may not have been turned so
-        options = [f"{options[0]}, or with {_as_words(back)}"]
-    if scale != 1:
-        options.insert(0, f"--mesh-scale {1 / scale:g}")
+    options = [f"--mesh-scale {1 / scale:g}"] if scale != 1 else []
+    if not np.array_equal(turn, np.eye(3)):
+        back = np.eye(4)
+        back[:3, :3] = turn.T
+        short = [told for other, told in known if np.array_equal(turn, other)]
+        options += [f"{option}; {else_} {_as_words(back)}" for option, else_ in short]
+        options += [] if short else [_as_words(back)]
     if not options:
         return parts
     last = parts[-1].removesuffix(")")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import mitsuba as mi
 import numpy as np
@@ -24,7 +24,10 @@ _CHANNELS = 5
 
 
 def quick_findings(
-    scene: mi.Scene, views: Sequence[View], photographs: Photographs
+    scene: mi.Scene,
+    views: Sequence[View],
+    photographs: Photographs,
+    unmerged: Callable[[], mi.Scene] | None = None,
 ) -> list[Finding]:
     """Look for poses, exposures and light that do not belong together.
 
@@ -32,6 +35,8 @@ def quick_findings(
         scene: that the photographs show.
         views: to train on.
         photographs: of these views.
+        unmerged: makes the same scene, whose shapes tell a ground from what stands on it; asked for
+            where poses seem to be wrong. None: the scene is such.
 
     Returns:
         Nothing where views are too few or too small to tell.
@@ -41,7 +46,10 @@ def quick_findings(
     if len(large) < FEWEST_VIEWS:
         return []
     small = _small_views(views, photographs, large)
-    better = misaligned(compared(scene, small, [small_camera(view.camera) for view in views]))
+    cameras = [small_camera(view.camera) for view in views]
+    better = misaligned(compared(scene, small, cameras))
+    if better is not None and unmerged is not None:
+        better = misaligned(compared(unmerged(), small, cameras))
     if better is not None:
         return [better]
     points = shared_points(small, seen_by(scene, [view.camera for view in small]))

@@ -74,7 +74,7 @@ def _doubts(
     hidden = dataset.background == "hidden"
     words = (scene, dataset.train, pixels.photographs, dataset.folder)
     found += pose_warnings(*words, hidden=hidden)
-    quick = quick_findings(scene, dataset.train, pixels.photographs)
+    quick = quick_findings(scene, dataset.train, pixels.photographs, lambda: _unmerged(dataset))
     # Of poses that see little of the scene, nothing else is told but what is surely wrong.
     quick = [finding for finding in quick if finding.level == "error" or not found]
     for finding in quick:
@@ -86,6 +86,11 @@ def _doubts(
     fitted = camera is not None and (camera.has_exposures or camera.has_response)
     found += (str(finding) for finding in quick if not (fitted and finding.check == "exposure"))
     return found
+
+
+def _unmerged(dataset: Dataset) -> mi.Scene:
+    """The scene of a data set, with all shapes that its file has."""
+    return parse(dataset.scene, dataset.root).instantiate(merge=False, bitmaps=False)
 
 
 def _placeholder(dataset: Dataset, problem: Problem) -> str | None:
