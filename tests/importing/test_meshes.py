@@ -11,8 +11,13 @@ import pytest
 import trimesh
 from layouts import APPLIED, quiet, write_blender, write_nerfstudio
 
+from unbake.acquisition.new_light import axis_of
+from unbake.dataset.camera import up_of
 from unbake.dataset.mistakes import UNITS, usual_mistakes
 from unbake.errors import UserError
+from unbake.exports.gltf import Document
+from unbake.exports.upright import Up
+from unbake.importing import gltf
 from unbake.importing import meshes as meshes_module
 from unbake.importing.faults import Faults, ImportFaults
 from unbake.importing.import_data import import_data
@@ -357,6 +362,92 @@ def test_what_is_told_of_the_mesh_cures_as_much_as_other_poses(mistake, captured
             (at - c.origin) @ c.to_world[:3, :3] for at, c in ((moved, camera), (points, corrected))
         )
         assert np.allclose(mistake.scale * here, there, rtol=1e-4, atol=1e-4 * mistake.scale)
+
+
+def exported(points, file, direction, generator=None):
+    """Write triangles as an export does, of a scene with this direction up.
+
+    Args:
+        generator: that the file tells; None: its own.
+    """
+    document = Document()
+    corners = document.array(points.astype(np.float32), "VEC3", bounds=True)
+    mesh = document.add("meshes", {"primitives": [{"attributes": {"POSITION": corners}}]})
+    node = document.add("nodes", {"name": "thing", "mesh": mesh})
+    document.json["scenes"][0]["nodes"].append(node)
+    document.turn(Up(np.array(direction, float), "", 0.0))
+    if generator is not None:
+        document.json["asset"]["generator"] = generator
+    document.write(file)
+
+
+@pytest.mark.parametrize("up", [(0, 0, 1), (0, 0, -1), (0, -1, 0), (1, 0, 0), (0.6, 0, 0.8)])
+def test_what_was_exported_upright_is_turned_back(up, tmp_path):
+    points = np.random.default_rng(0).normal(size=(9, 3))
+    exported(points, tmp_path / "own.glb", up)
+    (part,) = parts_of(tmp_path / "own.glb")
+    assert np.abs(part.positions - points).max() < 1e-6
+    (upright,) = read_parts([tmp_path / "own.glb"], Faults(), upright=True)
+    assert np.abs(upright.positions - points).max() > 0.1
+    assert np.abs(upright.positions @ (0, 1, 0) - points @ up).max() < 1e-6
+    exported(points, tmp_path / "other.glb", up, "another program")
+    (other,) = parts_of(tmp_path / "other.glb")
+    assert np.abs(other.positions - upright.positions).max() < 1e-6
+
+
+def test_what_an_export_did_not_turn_stays(tmp_path):
+    points = np.random.default_rng(0).normal(size=(9, 3))
+    exported(points, tmp_path / "own.glb", (0, 1, 0))
+    (part,) = parts_of(tmp_path / "own.glb")
+    assert np.abs(part.positions - points).max() < 1e-6
+
+
+def test_an_import_turns_back_what_was_exported(captured, tmp_path):
+    write_blender(captured, tmp_path / "blender")
+    points = trimesh.creation.box((1, 2, 3)).triangles.reshape(-1, 3)
+    lines, found = {}, {}
+    for name, generator in (("own", None), ("other", "another program")):
+        exported(points, tmp_path / f"{name}.glb", (0, 0, 1), generator)
+        lines[name], out = [], tmp_path / name
+        given = [tmp_path / f"{name}.glb"]
+        import_data(tmp_path / "blender", out, given, tell=lines[name].append)
+        (part,) = parts_of(*(out / "scene" / "meshes").iterdir())
+        found[name] = np.ptp(part.positions, axis=0)
+    assert np.allclose(found["own"], (1, 2, 3)) and np.allclose(found["other"], (1, 3, 2))
+    assert sum("it is turned back" in line for line in lines["own"]) == 1
+    assert sum("with --mesh-y-up" in line for line in lines["other"]) == 1
+    assert not any("--mesh-y-up" in line for line in lines["own"])
+
+
+@pytest.mark.parametrize("rotation", [None, [0, 0, 0, 0], [0, 1], ["x", 0, 0, 1]])
+def test_a_damaged_turn_is_not_taken_back(rotation, tmp_path):
+    top = {"asset": {"generator": "unbake 1"}, "nodes": [{"name": "upright"}]}
+    top |= {"scenes": [{"nodes": [0]}]}
+    if rotation is not None:
+        top["nodes"][0]["rotation"] = rotation
+    (tmp_path / "own.gltf").write_text(json.dumps(top))
+    assert gltf.turned_back(tmp_path / "own.gltf") is None
+
+
+def test_ways_up_that_may_differ_are_told(captured, tmp_path):
+    """Where cameras have z up, and the user did not say how a GLB file lies."""
+    tall = [view.camera for view in captured.views]
+    level = [replace(camera, to_world=TO_Z_UP.T @ camera.to_world) for camera in tall]
+    assert axis_of(up_of(level)) == "+y" and axis_of(up_of(tall)) == "+z"
+    points = np.random.default_rng(0).normal(size=(9, 3))
+    own, plain, other = (tmp_path / name for name in ("own.glb", "plain.glb", "other.glb"))
+    exported(points, own, (0, 0, 1))
+    exported(points, plain, (0, 1, 0))
+    exported(points, other, (0, 1, 0), "another program")
+
+    def told(file, cameras=tall, *, upright=False, moved=False):
+        return gltf.told_up([file], cameras, upright=upright, moved=moved)
+
+    assert told(own) == [f"mesh: unbake exported it upright, and it is turned back: {own}"]
+    assert told(own, upright=True) == told(plain) == told(tmp_path / "mesh.ply") == []
+    (line,) = told(other)
+    assert line.startswith("GLB files have y up") and line.endswith("with --mesh-y-up")
+    assert told(other, level) == told(other, upright=True) == told(other, moved=True) == []
 
 
 def with_corner(matrix):

@@ -30,6 +30,7 @@ from .colmap import find_model, read_colmap
 from .exposures import exposures_of, read_table
 from .faults import Faults
 from .frames import SPLIT_FILES, read_one_file, read_split_files
+from .gltf import told_up
 from .lamps import Lamp, find_lamps, with_lamps
 from .lens import WIDEST
 from .meshes import TO_Z_UP, Part, check_place, read_parts, write_scene
@@ -120,13 +121,10 @@ def import_data(
     if not given:
         faults.add("no mesh was given (--mesh FILE)")
     found = _balanced(found)
-    parts = read_parts(given, faults)
+    parts = read_parts(given, faults, upright=settings.mesh_y_up)
     parts = _placed(parts, found.world, settings, mesh_transform, mesh_matrix, faults)
     check_place(parts, faults)
-    known, told = exposures_of(found.shots)
-    if exposures is not None:
-        with faults.collected():
-            known, told = read_table(Path(exposures), found.shots, faults)
+    known, told = _exposures(found.shots, exposures, faults)
     _check_light(light, allow_outside, faults)
     if light is not None and settings.lamps == "found":
         faults.add("lamps are found where the light is unknown: leave out --lamps, or the light")
@@ -161,7 +159,9 @@ def import_data(
         )
         lamps = _put_lamps(data, parts, settings, enclosed, tell) if light is None else []
     sizes = _sizes(found.shots, splits, settings.longest)
-    changes = (*_straightening(found.shots), *pictures.told(), *sizes)
+    moved = mesh_matrix is not None or mesh_transform is not None
+    ways = told_up(given, _cameras(found.shots), upright=settings.mesh_y_up, moved=moved)
+    changes = (*ways, *_straightening(found.shots), *pictures.told(), *sizes)
     found = replace(found, notes=(*found.notes, *changes))
     told_of = [told, *_background(background, pictures, names, stray)]
     for line in (
@@ -256,6 +256,16 @@ def _balanced(source: Source) -> Source:
     if None not in (first, daylight[name]) and len(set(daylight.values()) - {None}) > 1:
         notes.append("white balance: sensors differ, each has it in factors of its own")
     return replace(source, shots=tuple(shots), notes=(*source.notes, *notes))
+
+
+def _exposures(
+    shots: Sequence[Shot], table: str | Path | None, faults: Faults
+) -> tuple[dict[str, float], str]:
+    """Exposures by name, of a table or as EXIF tells, and what is told of them."""
+    if table is not None:
+        with faults.collected():
+            return read_table(Path(table), shots, faults)
+    return exposures_of(shots)
 
 
 def _check_light(light: LightConfig | None, allow_outside: bool, faults: Faults) -> None:
@@ -425,7 +435,7 @@ def _write_scene(
     if light is not None:
         parsed = parse(file)
         put_light(parsed, light, allow_outside, tell)
-        tell_tilt(light, [shot.lens.camera(shot.to_world) for shot in shots], tell)
+        tell_tilt(light, _cameras(shots), tell)
         file = write(parsed, data.scene.resolve())
     return file, parse(file).instantiate()
 
@@ -521,7 +531,7 @@ def _shares_seen(
     Raises:
         UserError: none does; it tells what is known of the frame of cameras, and what may help.
     """
-    cameras = [shot.lens.camera(shot.to_world) for shot in source.shots]
+    cameras = _cameras(source.shots)
     seen = shares_seen(scene, cameras)
     if seen.any():
         return seen
@@ -604,6 +614,11 @@ def _moved(cameras: Sequence[Camera], turn: np.ndarray, scale: float) -> list[Ca
 def _corners(parts: Sequence[Part]) -> np.ndarray:
     """The least and the largest coordinates of each part, (2 n, 3)."""
     return np.concatenate([part.corners for part in parts])
+
+
+def _cameras(shots: Sequence[Shot]) -> list[Camera]:
+    """As they are where lenses are straight."""
+    return [shot.lens.camera(shot.to_world) for shot in shots]
 
 
 def _origins(shots: Sequence[Shot]) -> np.ndarray:

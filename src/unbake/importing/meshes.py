@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import logging
 import mmap
 import re
@@ -24,19 +23,13 @@ from ..scene.meshes import HEADER, check_mesh
 from ..scene.normals import repaired
 from ..scene.triangles import creased, write_mesh
 from .faults import Faults
+from .gltf import GLTF, plain_nodes, turned_back
 from .polygons import beyond_fans, fan, obj_in_triangles
 
 #: Suffixes of the meshes that are read.
-SUFFIXES = (".ply", ".obj", ".glb", ".gltf")
+SUFFIXES = (".ply", ".obj", *GLTF)
 #: Albedo and roughness of all parts: a fit does not read them.
 _ALBEDO, _ROUGHNESS = 0.5, 0.5
-#: Extensions of glTF that pack numbers, by what one may know them as.
-_PACKED = {
-    "KHR_draco_mesh_compression": "Draco",
-    "EXT_meshopt_compression": "meshopt",
-    "KHR_meshopt_compression": "meshopt",
-    "KHR_mesh_quantization": "quantized",
-}
 #: From y up to z up.
 TO_Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 #: Steps between positions in single precision, as a share of all geometry, that do not show.
@@ -97,16 +90,17 @@ class Part:
         write_mesh(file, positions, faces, normals, uv)
 
 
-def read_parts(files: Sequence[Path], faults: Faults) -> list[Part]:
+def read_parts(files: Sequence[Path], faults: Faults, *, upright: bool = False) -> list[Part]:
     """The parts of meshes: objects and groups of an OBJ file, nodes of a glTF file, all of a PLY.
 
-    Positions stay as they are, with the transforms of a glTF file's nodes. Faces with more than
-    three corners become triangles that fill them, also where they are not convex. Materials are
-    not read.
+    Positions stay as they are, with the transforms of a glTF file's nodes. One that `unbake export`
+    turned upright is turned back. Faces with more than three corners become triangles that fill
+    them, also where they are not convex. Materials are not read.
 
     Args:
         files: PLY, OBJ, GLB or glTF.
         faults: all that is wrong is added to it.
+        upright: nothing is turned back.
     """
     parts: list[Part] = []
     names = _Names()
@@ -116,8 +110,10 @@ def read_parts(files: Sequence[Path], faults: Faults) -> list[Part]:
             if own is not None:
                 parts.append(replace(own, name=names.unique(file.stem)))
                 continue
+            back = None if upright else turned_back(file)
             for name, mesh, to_file in _loaded(file):
-                parts.append(_part(names.unique(name or file.stem), mesh, to_file, file))
+                part = _part(names.unique(name or file.stem), mesh, to_file, file)
+                parts.append(part if back is None else part.moved(back))
     return parts
 
 
@@ -284,8 +280,8 @@ def _loaded(file: Path) -> list[tuple[str, Any, np.ndarray]]:
     if suffix not in SUFFIXES:
         raise UserError("the mesh is of a format that is not read (PLY, OBJ, GLB)", file)
     logging.getLogger("trimesh").setLevel(logging.CRITICAL)
-    of_nodes = suffix in (".glb", ".gltf")
-    own = _plain_nodes(file) if of_nodes else []
+    of_nodes = suffix in GLTF
+    own = plain_nodes(file) if of_nodes else []
     options: dict[str, Any] = {"process": False}
     opened: Any = file
     if suffix == ".obj":
@@ -389,30 +385,6 @@ def _lists(raw: dict[str, Any], names: Sequence[str]) -> list[np.ndarray] | None
             rows = data[name] if isinstance(data, dict) else data[name]["f1"]
             return [np.asarray(row) for row in rows]
     return None
-
-
-def _plain_nodes(file: Path) -> list[str]:
-    """The names of a glTF file's nodes.
-
-    Raises:
-        UserError: its numbers are packed, of which trimesh 5.2 reads some as zeros.
-    """
-    try:
-        with file.open("rb") as opened:
-            head = opened.read(20)
-            if head[:4] == b"glTF" and len(head) == 20:
-                told = opened.read(int.from_bytes(head[12:16], "little"))
-            else:
-                told = head + opened.read()
-        top = json.loads(told)
-        packed = [_PACKED[name] for name in top.get("extensionsRequired", ()) if name in _PACKED]
-        names = [str(node.get("name")) for node in top.get("nodes", ())]
-    except (OSError, ValueError, TypeError, AttributeError, RecursionError):
-        return []  # trimesh tells what is wrong with it
-    if packed:
-        what = f"the mesh is compressed ({', '.join(packed)})"
-        raise UserError(what, file, "Export it without compression")
-    return names
 
 
 def _part(name: str, mesh: Any, to_file: np.ndarray, file: Path) -> Part:

@@ -41,7 +41,7 @@ class ImportSettings:
         bool,
         Flag(
             "Turn the mesh from y up to z up, the world of Blender's cameras: glTF files, and OBJ "
-            "files as Blender writes them, have y up"
+            "files as Blender writes them, have y up. Exports of unbake are turned back without it"
         ),
     ] = False
     mesh_scale: Annotated[
