@@ -17,7 +17,7 @@ from unbake.dataset import alignment as aligning
 from unbake.dataset import quick_check
 from unbake.dataset.agreement import exposures, shared_points, turning_light
 from unbake.dataset.camera import Camera
-from unbake.dataset.findings import Check, misaligned
+from unbake.dataset.findings import Check, Finding, misaligned
 from unbake.dataset.mistakes import OPENCV, Mistake, all_mistakes
 from unbake.dataset.own_poses import compared
 from unbake.dataset.photographs import Photographs
@@ -775,6 +775,28 @@ def test_a_ground_that_hides_what_stands_on_it_is_not_taken_for_better():
         assert ("nearly nothing but the ground" in finding.what) == (name == "under")
     assert "of a world with y up" in misaligned(found["lying"]).what
     assert np.array_equal(found["under"].mistake.turn, over)
+
+
+@pytest.mark.parametrize(("score", "unseen", "level"), [
+    (0.5, False, "error"), (0.6, False, "warning"), (0.6, True, "error"),
+])  # fmt: skip
+def test_poses_that_most_edges_agree_with_are_not_refused(
+    score, unseen, level, captured, monkeypatch
+):
+    """As of a courtyard that looks alike upside down; what else is wrong is told, too."""
+    dataset = Dataset.load(captured("still"))
+    scene = parse(dataset.scene, dataset.root).instantiate()
+    photographs, turn = Photographs.load(dataset, False), Mistake(("turned (turn them)",))
+    other = aligning.Alignment(8, score, 0.5, mistake=turn, best=0.8, unseen=unseen)
+    finding = misaligned(other)
+    assert finding.level == level
+    assert finding.what.startswith("poses may be" if level == "warning" else "poses seem to be")
+    assert ("whether outlines fit" in finding.remedy) == (level == "warning")
+    uneven = Finding("warning", "exposure", "uneven")
+    monkeypatch.setattr(quick_check, "compared", lambda *_: other)
+    monkeypatch.setattr(quick_check, "unequal_exposures", lambda *_: uneven)
+    told = [found.check for found in quick_findings(scene, dataset.train, photographs)]
+    assert told == ["alignment", *(["exposure"] if level == "warning" else [])]
 
 
 def test_a_fit_doubts_poses_by_shapes_that_are_not_merged(captured, monkeypatch):

@@ -210,7 +210,8 @@ def _check_dataset(
         return
     _check_poses(result, scene, train)
     _check_pictures(result)
-    if any(finding.check == "alignment" for finding in result.findings):
+    wrong = any(finding.check == "alignment" for finding in result.findings)
+    if wrong and not (result.alignment and result.alignment.plausible):
         return  # with such poses, what views share and see is something else
     _check_light(result)
     result.coverage = _coverage(scene, train, hidden=dataset.background == "hidden")
@@ -334,7 +335,7 @@ def _check_poses(result: DataCheck, scene: mi.Scene, train: list[CheckedView]) -
     found = result.alignment = compared(scene, [v.small for v in train], cameras)
     better = misaligned(found)
     result.add(better)
-    if better is None:
+    if better is None or (found is not None and found.plausible):
         # What is wrong with the poses is told once.
         hidden = result.dataset is not None and result.dataset.background == "hidden"
         for problem in _pose_problems(scene, train, hidden, result.folder):

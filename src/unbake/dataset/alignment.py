@@ -22,6 +22,9 @@ SHORTEST_SIDE = 24
 MARGIN, AGREEING = 0.1, 0.75
 #: The least score by which other poses are better: the best of many has more than 0.1 by chance.
 LEAST = 0.2
+#: Poses whose edges agree by so much are most likely right, even if others agree better: a scene
+#: may look alike from several sides.
+_GOOD = 0.55
 #: Of other poses, the simplest mistake counts whose score is nearly the best.
 _NEARLY = 0.03
 #: All mistakes are tried on so many views, of at most 36 pixels, and so many of them on all views.
@@ -76,6 +79,11 @@ class Alignment:
     elsewhere: float | None = None
     focal: float | None = None
     unseen: bool = False
+
+    @property
+    def plausible(self) -> bool:
+        """Whether the poses are most likely right, though others agree better."""
+        return self.mistake is not None and not self.unseen and self.score >= _GOOD
 
 
 def alignment(scene: mi.Scene, views: Sequence[SmallView]) -> Alignment | None:

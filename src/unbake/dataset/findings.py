@@ -93,7 +93,8 @@ def misaligned(found: Alignment | None) -> Finding | None:
         what = f"photographs seem to be {found.mirrored}: {much} {found.best:.2f}"
         return Finding("error", "alignment", what, None, "Flip them, or write them again")
     assert found.mistake is not None
-    what = f"poses seem to be {found.mistake.parts[0].partition(' (')[0]}"
+    seem = "may" if found.plausible else "seem to"
+    what = f"poses {seem} be {found.mistake.parts[0].partition(' (')[0]}"
     for part in found.mistake.parts[1:]:
         what += f" and {part.partition(' (')[0]}"
     what += f": {much} {found.best:.2f}"
@@ -101,13 +102,11 @@ def misaligned(found: Alignment | None) -> Finding | None:
         what += ". As they are, views see nearly nothing but the ground"
     remedies = [part.partition(" (")[2].removesuffix(")") for part in found.mistake.parts]
     remedy = ", and ".join(remedies)
-    return Finding(
-        "error",
-        "alignment",
-        what,
-        None,
-        f"{remedy[0].upper()}{remedy[1:]}",
-    )
+    if found.plausible:
+        page = "see on the page of data check (--out check.html) whether outlines fit"
+        remedy = f"{page}; if they do not: {remedy}"
+    level: Level = "warning" if found.plausible else "error"
+    return Finding(level, "alignment", what, None, f"{remedy[0].upper()}{remedy[1:]}")
 
 
 def _of_others(found: Alignment, share: float, best: float) -> Finding:

@@ -47,16 +47,18 @@ def quick_findings(
         return []
     small = _small_views(views, photographs, large)
     cameras = [small_camera(view.camera) for view in views]
-    better = misaligned(compared(scene, small, cameras))
+    aligned = compared(scene, small, cameras)
+    better = misaligned(aligned)
     if better is not None and unmerged is not None:
-        better = misaligned(compared(unmerged(), small, cameras))
-    if better is not None:
+        aligned = compared(unmerged(), small, cameras)
+        better = misaligned(aligned)
+    if better is not None and not (aligned and aligned.plausible):
         return [better]
     points = shared_points(small, seen_by(scene, [view.camera for view in small]))
     found = exposures(points, len(small))
     names = [view.name for view in small]
-    both = unequal_exposures(found, names), light_that_turns(turning_light(points, found))
-    return [finding for finding in both if finding is not None]
+    every = better, unequal_exposures(found, names), light_that_turns(turning_light(points, found))
+    return [finding for finding in every if finding is not None]
 
 
 def _shorter_side(view: View) -> int:
