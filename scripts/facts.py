@@ -10,7 +10,7 @@ import csv
 import math
 import re
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -211,17 +211,37 @@ class Facts:
         constants = {row["data"]: self._constant(row, KEYS[quantity]) for row in self.in_time()}
         return [f"`{data}`" for data, score in constants.items() if score and score >= HIGHEST]
 
-    def below_constant(self, method: str) -> list[str]:
-        """Where a method of `in_time` scores less than one value for the whole scene, in words.
+    def below(self, method: str, kind: str) -> list[str]:
+        """Where a method of `in_time` scores less than a yardstick, in words.
 
         Scenes that one value describes without error are left out.
+
+        Args:
+            method: its better row, where there are several.
+            kind: `constant`, or `untrained`, the fields before the first step.
         """
-        told = []
-        for word, key in (("albedo", "albedo_psnr"), ("roughness", "roughness_psnr")):
-            for row in self.in_time():
-                score = self._constant(row, key)
-                if score is not None and row[method][key] < score < HIGHEST:
-                    told.append(f"{word} of `{row['data']}`")
+        rows = self.in_time()
+        return lower((row["data"], row[method], row["yardsticks"].get(kind, {})) for row in rows)
+
+    def below_in(self, found: Row, method: str, kind: str) -> list[str]:
+        """Where a method does so in one result by `benchmarks/variants.py`."""
+        rows = [row for row in found["rows"] if row["method"] == method]
+        return lower((row["data"], row, self.yardsticks(found, row).get(kind, {})) for row in rows)
+
+    def ahead_of_ours(self, found: Row, rival: str) -> dict[str, list[str]]:
+        """Where a rival is ahead in a result by `benchmarks/variants.py`, as one digit shows it.
+
+        Returns:
+            By what is compared, where there is any: scenes with the scores of both.
+        """
+        by_name = {(row["data"], row["method"]): row for row in found["rows"]}
+        told: dict[str, list[str]] = {}
+        for word, key in KEYS.items():
+            for data in found["data"]:
+                other, ours = by_name[data, rival][key], by_name[data, "ours"][key]
+                if round(other, 1) > round(ours, 1):
+                    scores = f"{other:.1f} dB against {ours:.1f} dB"
+                    told.setdefault(word, []).append(f"`{data}` ({scores})")
         return told
 
     @staticmethod
@@ -491,6 +511,17 @@ def part(row: Mapping[str, Any], key: str, where: str) -> Any:
     if row.get(key) is None:
         raise Unfounded(f"{where} has no {key!r}. It has: {', '.join(map(str, row))}")
     return row[key]
+
+
+def lower(rows: Iterable[tuple[str, Row, Row]]) -> list[str]:
+    """Where scores of scenes are lower than others, in words: those of one value are left out."""
+    told = list(rows)
+    return [
+        f"{word} of `{data}`"
+        for word, key in (("albedo", "albedo_psnr"), ("roughness", "roughness_psnr"))
+        for data, scores, least in told
+        if least.get(key) is not None and scores[key] < least[key] < HIGHEST
+    ]
 
 
 def _old_fits(result: Row) -> bool:

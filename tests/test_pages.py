@@ -212,9 +212,35 @@ def test_scores_below_a_constant_are_told(writer, tmp_path):
         row |= {"albedo_psnr": 10.0, "constant_albedo_psnr": 9.0, "roughness_psnr": 20.0}
         row["constant_roughness_psnr"] = 21.0 if row["data"] == "staircase" else 19.0
     (results / "rooms.json").write_text(json.dumps(content))
-    found = writer["Facts"](results, ROOT / "docs" / "reproduction").below_constant("prb")
+    found = writer["Facts"](results, ROOT / "docs" / "reproduction").below("prb", "constant")
     assert "roughness of `staircase`" in found and not any("kitchen" in told for told in found)
     assert not any("`dragon`" in told for told in found)
+
+
+def test_scenes_written_by_hand_tell_where_path_replay_is_ahead_or_below_what_it_started_from(
+    writer, tmp_path
+):
+    results = tmp_path / "results"
+    shutil.copytree(ROOT / "benchmarks" / "results", results)
+    content = json.loads((results / "hand-made.json").read_text())
+    for row in content["rows"]:
+        prb = row["method"] == "prb"
+        row["render_psnr"] = 77.71 if prb and row["data"] == "attic" else 66.6
+        row |= {"albedo_psnr": 30.0 + prb * (row["data"] == "box"), "untrained_albedo_psnr": 10.0}
+        row |= {"roughness_psnr": 20.04, "untrained_roughness_psnr": 10.0}
+        if prb and row["data"] == "bulb":
+            row |= {"untrained_roughness_psnr": 20.5, "roughness_psnr": 20.0}
+    (results / "hand-made.json").write_text(json.dumps(content))
+    page = writer["page"]("docs/comparison.md", results=results)
+    part = page.split("### Scenes written by hand")[1].split("## How each method")[0]
+    rows = {line.split("`")[1]: line for line in part.splitlines() if line.startswith("| `")}
+    assert rows["attic"].endswith("| 77.7 dB | 66.6 dB |") and "66.6 dB | 66.6" in rows["bulb"]
+    words = " ".join(part.split())
+    ahead = "ahead of `ours` in 1 of 15 scenes: "
+    assert f"In rendering, `prb` is {ahead}`attic` (77.7 dB against 66.6 dB)." in words
+    assert f"In albedo, `prb` is {ahead}`box` (31.0 dB against 30.0 dB)." in words
+    assert "In roughness, `prb`" not in words
+    assert "untrained fields are, of `prb`: roughness of `bulb`; of `ours`: nothing." in words
 
 
 def test_the_squared_prior_is_named_as_its_figure_names_it(writer, tmp_path):
