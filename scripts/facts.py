@@ -152,19 +152,21 @@ class Facts:
         """Time of a step as a multiple of that of ours with the same materials."""
         return benchmark_tables.ratio(self.step(name, method, materials, spp), self.result(name))
 
-    def in_time(self) -> list[Row]:
+    def in_time(self, settings: str | None = None) -> list[Row]:
         """Ours beside PRB after the same training time, a row a scene, by `benchmarks/variants.py`.
 
         Rows have `data`, `seconds` and `seeds`, the row of each method by its name, their
         `yardsticks`, and `how` they were made: the processor, and what has changed since. Of a
-        method with several settings it is the row with the best mean of albedo and roughness.
+        method with several settings it is the row with the best mean of albedo and roughness, or
+        that of the settings that are asked for.
         """
         rows = []
         for name in ("demo-in-time", "rooms", "objects", "lego-plant"):
             found = self.result(name) if self.has(name) else {"rows": []}
             by_scene: dict[str, Row] = {}
             on = f"on an {found['machine']['processor']}" if found["rows"] else ""
-            for row in sorted(found["rows"], key=lambda row: sum(row[key] for key in MAPS)):
+            asked = [row for row in found["rows"] if settings in (None, row["settings"])]
+            for row in sorted(asked, key=lambda row: sum(row[key] for key in MAPS)):
                 by_scene.setdefault(row["data"], {})[row["method"]] = row
             by_scene = {name: by_scene[name] for name in found.get("data", ())}
             rows += [
@@ -211,7 +213,7 @@ class Facts:
         constants = {row["data"]: self._constant(row, KEYS[quantity]) for row in self.in_time()}
         return [f"`{data}`" for data, score in constants.items() if score and score >= HIGHEST]
 
-    def below(self, method: str, kind: str) -> list[str]:
+    def below(self, method: str, kind: str, settings: str | None = None) -> list[str]:
         """Where a method of `in_time` scores less than a yardstick, in words.
 
         Scenes that one value describes without error are left out.
@@ -219,8 +221,9 @@ class Facts:
         Args:
             method: its better row, where there are several.
             kind: `constant`, or `untrained`, the fields before the first step.
+            settings: the row of these instead.
         """
-        rows = self.in_time()
+        rows = self.in_time(settings)
         return lower((row["data"], row[method], row["yardsticks"].get(kind, {})) for row in rows)
 
     def below_in(self, found: Row, method: str, kind: str) -> list[str]:
@@ -466,6 +469,17 @@ class Facts:
             for scene in self.by_scene(experiment)
         ]
         return sum(self.ahead(experiment, key, *pair).startswith("+") for pair in pairs)
+
+    def below_untrained(self, experiment: str, method: str) -> list[str]:
+        """Where a method scores less than the untrained fields of its scene, in words."""
+        told = []
+        for word, key in KEYS.items():
+            for scene in self.by_scene(experiment):
+                start = self.where(experiment, scene=scene, method="untrained")[key]
+                end = self.where(experiment, scene=scene, method=method)[key]
+                if end < start:
+                    told.append(f"{word} of {scene} ({end:.1f} dB against {start:.1f} dB)")
+        return told
 
     def published_is_smaller(self, experiment: str, method: str) -> list[bool]:
         """Of each published scene, whether a method's multiple of ours is smaller there."""

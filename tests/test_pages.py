@@ -217,6 +217,40 @@ def test_scores_below_a_constant_are_told(writer, tmp_path):
     assert not any("`dragon`" in told for told in found)
 
 
+def test_fits_below_the_untrained_fields_are_told(writer, tmp_path):
+    results, kept = tmp_path / "results", tmp_path / "reproduction"
+    shutil.copytree(ROOT / "benchmarks" / "results", results)
+    shutil.copytree(ROOT / "docs" / "reproduction", kept)
+    content = json.loads((results / "rooms.json").read_text())
+    for row in content["rows"]:
+        row |= {"albedo_psnr": 20.0, "untrained_albedo_psnr": 10.0}
+        row |= {"roughness_psnr": 20.0, "untrained_roughness_psnr": 10.0}
+        if row["data"] == "kitchen" and row["method"] == "prb":
+            row["albedo_psnr"] = 9.0 if row["settings"] == "defaults" else 11.0
+    (results / "rooms.json").write_text(json.dumps(content))
+    facts = writer["Facts"](results, kept)
+    assert facts.below("prb", "untrained") == []
+    assert facts.below("prb", "untrained", "defaults") == ["albedo of `kitchen`"]
+    readme = " ".join(writer["page"]("README.md", results=results).split())
+    told = "Training makes `prb` worse than the untrained fields in nothing; with its defaults in"
+    assert f"{told} albedo of `kitchen`." in readme
+    page = " ".join(writer["page"]("docs/comparison.md", results=results).split())
+    low = "better of its settings: nothing; with its defaults: albedo of `kitchen`; of `ours`: no"
+    assert low in page
+    file = kept / "fig6" / "data.csv"
+    rows = list(csv.DictReader(file.read_text().splitlines()))
+    for row in rows:
+        least = {"untrained": 10.0, "PRB": 9.0 if row["scene"] == "LEGO" else 11.0}
+        row["render_psnr"] = least.get(row["method"], 12.0)
+        row["albedo_psnr"] = row["roughness_psnr"] = 10.0
+    with open(file, "w", newline="") as out:
+        table = csv.DictWriter(out, rows[0])
+        table.writeheader()
+        table.writerows(rows)
+    page = " ".join(writer["page"]("docs/reproduction.md", results=results, kept=kept).split())
+    assert "PRB in rendering of LEGO (9.0 dB against 10.0 dB); AD-PT in nothing; ours in no" in page
+
+
 def test_scenes_written_by_hand_tell_where_path_replay_is_ahead_or_below_what_it_started_from(
     writer, tmp_path
 ):
