@@ -251,6 +251,31 @@ def test_fits_below_the_untrained_fields_are_told(writer, tmp_path):
     assert "PRB in rendering of LEGO (9.0 dB against 10.0 dB); AD-PT in nothing; ours in no" in page
 
 
+def test_losses_at_equal_samples_stand_where_gains_do(writer, tmp_path):
+    results, kept = tmp_path / "results", tmp_path / "reproduction"
+    shutil.copytree(ROOT / "benchmarks" / "results", results)
+    shutil.copytree(ROOT / "docs" / "reproduction", kept)
+    content = json.loads((results / "equal-demo.json").read_text())
+    content["seeds"] = [0, 1, 2, 3]
+    content["methods"]["ours"] |= {"samples": 7.7e6, "steps": 1234, "albedo_psnr_sd": 2.25}
+    (results / "equal-demo.json").write_text(json.dumps(content))
+    file = kept / "fig6" / "data.csv"
+    rows = list(csv.DictReader(file.read_text().splitlines()))
+    for row in rows:
+        worse = row["method"] == "ours" and row["scene"] == "LEGO"
+        row["albedo_psnr_at_equal_samples"] = 17.75 if worse else 20.0
+    with open(file, "w", newline="") as out:
+        table = csv.DictWriter(out, rows[0])
+        table.writeheader()
+        table.writerows(rows)
+    for page in ("README.md", "docs/comparison.md"):
+        words = " ".join(writer["page"](page, results=results, kept=kept).split())
+        assert "in the albedo of LEGO (−2.2 dB), the roughness of DRAGON" in words, page
+    readme = " ".join(writer["page"]("README.md", results=results, kept=kept).split())
+    assert "(7.7 M, which are 1,234 steps of ours and" in readme and "; 4 seeds," in readme
+    assert "± 2.2 dB against" in readme
+
+
 def test_scenes_written_by_hand_tell_where_path_replay_is_ahead_or_below_what_it_started_from(
     writer, tmp_path
 ):
