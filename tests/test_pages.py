@@ -190,9 +190,9 @@ def test_constants_and_ceilings_stand_beside_methods(writer, tmp_path):
     (results / "ceilings.json").write_text(json.dumps({"rows": rows}))
     page, readme = (writer["page"](n, results=results) for n in ("docs/comparison.md", "README.md"))
     ceiling = f"{both['ceiling_albedo_psnr']:.1f} dB"
-    assert f"| `plant` | ceiling |  | {ceiling} | 41.5 dB |  |\n" in page
+    assert f"| `plant` | ceiling |  |  | {ceiling} | 41.5 dB |  |\n" in page
     assert "| `kitchen` | ceiling" not in page and "| `kitchen` | constant |" in page
-    assert "| `dragon` | constant |  | no error | no error |  |\n" in page
+    assert "| `dragon` | constant |  |  | no error | no error |  |\n" in page
     words = " ".join(page.split())
     assert f"its ceiling of albedo is {ceiling}, and `ours` is within 0.2 dB of it" in words
     assert "Three rows of each scene" in words and "as [above]" in words
@@ -249,6 +249,20 @@ def test_fits_below_the_untrained_fields_are_told(writer, tmp_path):
         table.writerows(rows)
     page = " ".join(writer["page"]("docs/reproduction.md", results=results, kept=kept).split())
     assert "PRB in rendering of LEGO (9.0 dB against 10.0 dB); AD-PT in nothing; ours in no" in page
+
+
+def test_samples_stand_beside_steps_and_the_limit_of_renderings_is_told(writer, tmp_path):
+    results = tmp_path / "results"
+    shutil.copytree(ROOT / "benchmarks" / "results", results)
+    content = json.loads((results / "rooms.json").read_text())
+    content["rows"][0] |= {"samples": 98_765_432, "steps": 4321}
+    (results / "rooms.json").write_text(json.dumps(content))
+    content = json.loads((results / "demo.json").read_text())
+    content["methods"]["ours"]["true_render_psnr"] = 28.25
+    (results / "demo.json").write_text(json.dumps(content))
+    page = writer["page"]("docs/comparison.md", results=results)
+    assert "| `kitchen` | `ours` | 4,321 | 98.8 | " in page
+    assert "the true materials, rendered alike, have 28.2 dB" in " ".join(page.split())
 
 
 def test_losses_at_equal_samples_stand_where_gains_do(writer, tmp_path):
