@@ -15,6 +15,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "benchmarks"))
 sys.path.append(str(ROOT / "tests"))
@@ -102,6 +104,16 @@ class Facts:
         """A PSNR in dB; with its standard deviation if there are several seeds."""
         self.of(name, method, key)
         return f"{plus_minus(self.method(name, method), KEYS.get(key, key), digits)} dB"
+
+    def halfway(self, name: str, method: str, key: str) -> tuple[float, float]:
+        """Scores during training, mean over seeds: at half of the time, and at the end."""
+        key, found = KEYS.get(key, key), []
+        for run in self.of(name, method, "per_seed"):
+            curve = part(run, "score", f"{name}.json, {method}")
+            times, scores = zip(*((row["seconds"], row[key]) for row in curve), strict=True)
+            found.append((float(np.interp(times[-1] / 2, times, scores)), scores[-1]))
+        middles, ends = zip(*found, strict=True)
+        return sum(middles) / len(middles), sum(ends) / len(ends)
 
     def gap(self, name: str, a: str, b: str, key: str, other: str | None = None) -> str:
         """How far a is above b: `+2.4 dB`, `−0.3 dB` or `level`.

@@ -265,6 +265,21 @@ def test_samples_stand_beside_steps_and_the_limit_of_renderings_is_told(writer, 
     assert "the true materials, rendered alike, have 28.2 dB" in " ".join(page.split())
 
 
+def test_roughness_of_path_replay_that_is_less_after_more_time_is_told(writer, tmp_path):
+    results = tmp_path / "results"
+    shutil.copytree(ROOT / "benchmarks" / "results", results)
+    content = json.loads((results / "rivals-demo.json").read_text())
+    curve = [{"seconds": s, "roughness_psnr": 11.0 + s} for s in (0.0, 2.5, 10.0)]
+    for run in content["methods"]["prb"]["per_seed"]:
+        run["score"] = [row | {"albedo_psnr": 20.0} for row in curve]
+    for roughness, less in ((19.0, True), (12.0, False)):
+        content["methods"]["prb"]["roughness_psnr"] = roughness
+        (results / "rivals-demo.json").write_text(json.dumps(content))
+        page = " ".join(writer["page"]("docs/comparison.md", results=results).split())
+        assert ("The scores of the longer fits are lower" in page) == less
+        assert ("goes from 16.0 dB halfway to 21.0 dB at the end" in page) == less
+
+
 def test_losses_at_equal_samples_stand_where_gains_do(writer, tmp_path):
     results, kept = tmp_path / "results", tmp_path / "reproduction"
     shutil.copytree(ROOT / "benchmarks" / "results", results)
