@@ -74,6 +74,10 @@ def test_two_methods_side_by_side(compare, tmp_path):
         assert row["rate_factors"] == {k: config.rate_factors[k] for k in row["rate_factors"]}
         assert row["estimator"] == "all-pairs" and row["representation"] == "neural"
         assert row["radiance"] == {"ours": "neural", "direct": None}[name]
+        own = ("final_learning_rate", "warm_up", "beta2", "least_slope")
+        assert {key: row[key] for key in own} == {key: getattr(config, key) for key in own}
+        searches = newest_progress(RunFolder(out / name)).searched
+        assert row["searches"] == searches
         metrics = json.loads((out / name / "evaluation" / "metrics.json").read_text())
         assert row["heldout"] == metrics["heldout"] and row["train"] == metrics["train"]
         assert [point["step"] for point in row["score"]] == [0, 4, 8]
@@ -90,7 +94,11 @@ def test_two_methods_side_by_side(compare, tmp_path):
     raced = {(t["run"], t["quantity"]) for t in found["time_to_quality"] if t["below"] == 0}
     assert raced == {(run, name) for run in ("ours", "direct") for name in ("albedo", "roughness")}
     assert found["format"] == 2 and "1 and 2 dB" in found["definitions"]["time_to_quality"]
-    assert "ms/step" in outcome.out and "Seconds to roughness PSNR" in outcome.out
+    assert found["methods"]["direct"]["beta2"] > found["methods"]["ours"]["beta2"]
+    assert found["definitions"].keys() >= {*own, "searches"}
+    assert (
+        "ms a step" in " ".join(outcome.out.split()) and "Seconds to roughness PSNR" in outcome.out
+    )
     page = (out / "report.html").read_text()
     assert "Time to quality" in page and "Held-out albedo PSNR" in page
     assert "all pairs" in page and "Validation during training" not in page
@@ -187,7 +195,7 @@ def test_the_ceiling_of_the_fields_stands_below_the_methods(compare, cornell, tm
     assert metrics["yardsticks"] == found["direct"]["yardsticks"]
     table = outcome.out[outcome.out.index("Held-out views, PSNR in dB") :]
     for scores in ceilings.values():
-        assert f"{scores['albedo_psnr']:.2f}" in table
+        assert f"{scores['albedo_psnr']:.1f}" in table
     assert table.index("no-prior") < table.index("constant") < table.index("ceiling")
     page = (tmp_path / "out" / "report.html").read_text()
     assert page.count('<tr><th scope="row">Ceiling</th>') == 2

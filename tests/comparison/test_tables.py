@@ -8,7 +8,7 @@ from unbake.comparison import tables
 from unbake.comparison.tables import print_comparison, print_step_times
 
 START = {"heldout": {"render_psnr": 11.0, "albedo_psnr": 12.25}}
-LENGTH = {"steps": 5, "seconds": 2.0, "milliseconds_per_step": None, "samples_per_second": 1e3}
+LENGTH = {"steps": 5, "samples": 2_560_000, "seconds": 2.0, "milliseconds_per_step": None}
 
 
 def printed(show, content, width=200):
@@ -25,8 +25,8 @@ def test_untrained_fields_are_the_first_row():
     text = printed(print_comparison, compared({"ours": LENGTH | {"heldout": {"albedo_psnr": 9.5}}}))
     rows = [line.split("│")[1:] for line in text.splitlines() if line.startswith("│")]
     cells = [[cell.strip() for cell in row] for row in rows]
-    assert cells[0][:4] == ["untrained", "11.00", "12.25", "0"] and not any(cells[0][4:])
-    assert cells[1][:4] == ["ours", "—", "9.50", "5"]
+    assert cells[0][:4] == ["untrained", "11.0", "12.2", "0"] and not any(cells[0][4:])
+    assert cells[1][:7] == ["ours", "—", "9.5", "5", "2.6", "2 s", "—"]
 
 
 def test_a_comparison_has_a_column_for_each_quantity(monkeypatch):
@@ -35,10 +35,10 @@ def test_a_comparison_has_a_column_for_each_quantity(monkeypatch):
     methods = {"ours": LENGTH | {"heldout": means}, "prb": {"error": "no memory"}}
     text = printed(print_comparison, compared(methods))
     assert "albedo" in text and "roughness" in text and "gloss" not in text
-    assert "30.12" in text and "—" in text and "failed" in text
+    assert " 30.1 " in text and "—" in text and "failed" in text
     methods["ours"]["heldout"] = means | {"gloss_psnr": 17.0}
     text = printed(print_comparison, compared(methods))
-    assert "gloss" in text and "17.00" in text
+    assert "gloss" in text and " 17.0 " in text
 
 
 def test_aligned_albedo_has_a_column_where_some_run_has_it():
@@ -48,9 +48,9 @@ def test_aligned_albedo_has_a_column_where_some_run_has_it():
     text = printed(print_comparison, compared(methods))
     rows = [[c.strip() for c in x.split("│")[1:6]] for x in text.splitlines() if x[:1] == "│"]
     assert "albedo, aligned" in text
-    assert rows[0] == ["untrained", "11.00", "12.25", "—", "0"]
-    assert rows[1] == ["ours", "20.00", "12.50", "31.75", "5"]
-    assert rows[2][:4] == ["constant", "", "15.00", ""]
+    assert rows[0] == ["untrained", "11.0", "12.2", "—", "0"]
+    assert rows[1] == ["ours", "20.0", "12.5", "31.8", "5"]
+    assert rows[2][:4] == ["constant", "", "15.0", ""]
     del means["albedo_psnr_aligned"]
     assert "aligned" not in printed(print_comparison, compared(methods))
 
@@ -62,12 +62,37 @@ def test_yardsticks_are_the_last_rows():
     methods = {"ours": row | own, "prb": row | own, "direct": row | {"representation": "grid"}}
     lines = printed(print_comparison, compared(methods), width=80).splitlines()
     rows = [[c.strip() for c in line.split("│")[1:4]] for line in lines if line.startswith("│")]
-    assert rows[-2:] == [["constant", "", "12.00"], ["ceiling", "", "33.25"]]
+    assert rows[-2:] == [["constant", "", "12.0"], ["ceiling", "", "33.2"]]
     methods["direct"]["yardsticks"] = {"ceiling": {"albedo_psnr": 31.5}, "constant": low}
     text = printed(print_comparison, compared(methods))
     assert "ceiling neural" in text and "ceiling grid" in text and "constant grid" not in text
     methods["prb"] = row | {"representation": "neural", "yardsticks": {"ceiling": None}}
-    assert "33.25" in printed(print_comparison, compared(methods))
+    assert "33.2" in printed(print_comparison, compared(methods))
+
+
+def test_what_scores_cannot_tell_is_said_below_them():
+    means = {"render_psnr": 22.06, "albedo_psnr": 28.0}
+    marks = {"representation": "neural", "yardsticks": {"constant": {"albedo_psnr": 12.0}}}
+    content = compared({"ours": LENGTH | marks | {"heldout": means}})
+    text = " ".join(printed(print_comparison, content, width=80).split())
+    assert "22.1" in text and "22.06" not in text and "One fit of each method: its spread" in text
+    assert "told with --evaluate-truth alone" in text and "true materials" not in text
+    content["methods"]["ours"]["heldout"] = means | {"true_render_psnr": 24.53}
+    text = printed(print_comparison, content, width=80)
+    rows = [[c.strip() for c in line.split("│")[1:4]] for line in text.splitlines() if "│" in line]
+    assert rows[-1] == ["true", "24.5", ""] or rows[-1] == ["true materials", "24.5", ""]
+    assert "--evaluate-truth" not in text
+    del content["methods"]["ours"]["yardsticks"], means["albedo_psnr"]
+    content["methods"]["ours"]["heldout"] = means  # nobody knows the true materials
+    assert "--evaluate-truth" not in printed(print_comparison, content)
+
+
+def test_scores_of_methods_fit_into_80_columns():
+    means = {"render_psnr": 24.4, "albedo_psnr": 31.8, "roughness_psnr": 27.1}
+    row = {"steps": 2400, "samples": 66_860_971, "seconds": 120.0, "milliseconds_per_step": 98.5}
+    methods = {name: row | {"heldout": means} for name in ("ours", "prb", "with-second-bounce")}
+    text = printed(print_comparison, compared(methods), width=80)
+    assert max(map(len, text.splitlines())) <= 80 and "66.9" in text
 
 
 def test_what_is_known_of_lighting_is_printed():
@@ -118,11 +143,11 @@ def test_long_names_are_folded_rather_than_cut():
 
 
 def test_numbers_are_never_cut():
-    means = {"render_psnr": 20.51, "albedo_psnr": 12.52, "albedo_psnr_aligned": 31.73}
-    means |= {"roughness_psnr": 21.24, "metallic_psnr": 33.35}
+    means = {"render_psnr": 20.5, "albedo_psnr": 12.5, "albedo_psnr_aligned": 31.7}
+    means |= {"roughness_psnr": 21.2, "metallic_psnr": 33.3}
     length = {"steps": 2400, "seconds": 5612.0, "milliseconds_per_step": 2338.5}
-    row = length | {"samples_per_second": 561234.0, "heldout": means}
-    numbers = ["20.51", "12.52", "31.73", "21.24", "33.35", "2400", "5612 s", "2338.5", "561234"]
+    row = length | {"samples": 561_234_567, "heldout": means}
+    numbers = ["20.5", "12.5", "31.7", "21.2", "33.3", "2400", "5612 s", "2338.5", "561.2"]
     for width in (40, 80, 120, 200):
         text = printed(print_comparison, compared({"ad-pt-neural-split-halves": row}), width)
         assert "…" not in text

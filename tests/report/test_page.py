@@ -287,6 +287,18 @@ def test_the_settings_that_differ_stand_out(made, tmp_path: Path):
     assert "radiance.neural.width" in shared and "<td>true</td>" in shared
 
 
+def test_methods_without_a_radiance_field_show_no_searches(made, tmp_path: Path):
+    for run, radiance in zip(made[1], ("neural", None), strict=True):
+        with (run / "config.toml").open("a") as config:
+            config.write("[roughness_search]\ntimes = 3\n")
+        file = run / "evaluation" / "metrics.json"
+        file.write_text(json.dumps(json.loads(file.read_text()) | {"radiance": radiance}))
+    text = write_report(made[1], tmp_path / "report.html").read_text()
+    differing = text.split("What differs between the runs.")[1].split("<details>")[0]
+    row = differing.split("roughness_search.times")[1].split("</tr>")[0]
+    assert re.findall(r"<td[^>]*>(\d+)</td>", row) == ["3", "0"]
+
+
 def test_the_page_loads_nothing(made, tmp_path: Path):
     text = write_report(made[1], tmp_path / "report.html").read_text()
     for tag, attributes in _Page(text).tags:

@@ -41,6 +41,11 @@ from .method_variant import MethodVariant
 from .tables import print_comparison
 
 DEFINITIONS = {
+    "final_learning_rate": "the part of their start to which all rates fall over the fit",
+    "warm_up": "steps over which the rates of the unknowns rise",
+    "beta2": "Adam's β₂ for the unknowns at the first steps",
+    "least_slope": "least slope of the bounds of albedo in gradients; 0: their own",
+    "searches": "of roughness, that were made; methods without a radiance field make none",
     "samples": "camera samples traced in training, those of searches of roughness included; of an "
     "estimator with two passes, both count",
     "seconds": "training time: without scores, previews and checkpoints, with searches of "
@@ -76,6 +81,8 @@ _OF_SEVERAL = (
 UNTRAINED = "untrained"
 #: The method of that run, which learns nothing: any has the same fields before its first step.
 _CHEAPEST = MethodVariant("direct")
+#: Settings of a method that it may have of its own, besides those that describe a run anywhere.
+OF_METHOD = ("final_learning_rate", "warm_up", "beta2", "least_slope")
 #: Metrics of an evaluation that describe recovered lighting.
 LIGHTING = ("environment", "emission", "albedo_scale")
 #: Keys of an evaluation that the comparison needs.
@@ -172,10 +179,11 @@ def compare(
                         allow_doubtful=allow_doubtful,
                     )
                     metrics = _evaluated(dataset, run, progress, evaluation, console)
-                rows[name] = description(fits[name]) | _numbers(run, metrics, fits[name])
+                rows[name] = _of_method(fits[name]) | _numbers(run, metrics, fits[name])
+                rows[name]["searches"] = progress.searched
             except UserError as error:
                 errors[name] = error
-                rows[name] = description(fits[name]) | {"error": str(error)}
+                rows[name] = _of_method(fits[name]) | {"error": str(error)}
                 console.print(f"error: {error}", style="red", markup=False, soft_wrap=True)
             # Free the memory of this method for the next one.
             gc.collect()
@@ -374,6 +382,11 @@ def _evaluated(
         allow_outside=dataset.allow_outside,
         tell=lambda line: console.print(line, soft_wrap=True),
     )
+
+
+def _of_method(config: FitConfig) -> dict[str, Any]:
+    """What tells the settings of a method from those of others."""
+    return description(config) | {key: getattr(config, key) for key in OF_METHOD}
 
 
 def _numbers(run: RunFolder, metrics: dict[str, Any], config: FitConfig) -> dict[str, Any]:

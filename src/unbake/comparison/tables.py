@@ -12,6 +12,12 @@ from ..quantities import ALIGNED, QUANTITIES
 
 Row = dict[str, Any]
 
+#: What is told below the scores.
+_ONE_SEED = (
+    "One fit of each method: its spread between seeds is not known, and differences of some tenths "
+    "of a dB may be chance."
+)
+_NO_LIMIT = "How much of the error of renderings is noise is told with --evaluate-truth alone."
 #: Characters that a column of names may be folded to where a table is too wide.
 _NARROWEST = 12
 
@@ -62,7 +68,7 @@ def _print_quality(rows: dict[str, Row], console: Console) -> None:
     if any(ALIGNED in means for means in evaluated):
         columns[ALIGNED] = "albedo, aligned"
     table = _table("run", title="Held-out views, PSNR in dB")
-    _add_numbers(table, *columns.values(), "steps", "time", "ms/step", "samples/s")
+    _add_numbers(table, *columns.values(), "steps", "M\nsamples", "time", "ms a\nstep")
     for name, row in rows.items():
         if "error" in row:
             table.add_row(name, "failed")
@@ -75,11 +81,17 @@ def _print_quality(rows: dict[str, Row], console: Console) -> None:
     for label, scores in (pair for pairs in measured for pair in pairs):
         told = zip(columns, _scores(scores, columns), strict=True)
         table.add_row(label, *(x if key in own else "" for key, x in told))
+    limit = next((m["true_render_psnr"] for m in evaluated if m.get("true_render_psnr")), None)
+    if limit is not None:
+        table.add_row("true materials", _number(limit, 1))
     _show(table, console)
+    console.print(_ONE_SEED)
+    if limit is None and any(measured):  # the true materials are known
+        console.print(_NO_LIMIT)
 
 
 def _scores(means: Row, keys: Iterable[str]) -> list[str]:
-    return [_number(means.get(key), 2) for key in keys]
+    return [_number(means.get(key), 1) for key in keys]
 
 
 def _yardsticks(rows: dict[str, Row], kind: str) -> list[tuple[str, Row]]:
@@ -95,11 +107,11 @@ def _yardsticks(rows: dict[str, Row], kind: str) -> list[tuple[str, Row]]:
 
 
 def _effort(row: Row) -> list[str]:
-    """Steps and times of a run; nothing for untrained fields."""
+    """Steps, samples and times of a run; nothing for untrained fields."""
     if "steps" not in row:
         return ["0"]
-    time, rate = row["milliseconds_per_step"], row["samples_per_second"]
-    return [str(row["steps"]), f"{row['seconds']:.0f} s", _number(time, 1), _number(rate, 0)]
+    millions, time = row["samples"] / 1e6, row["milliseconds_per_step"]
+    return [str(row["steps"]), f"{millions:.1f}", f"{row['seconds']:.0f} s", _number(time, 1)]
 
 
 def _print_lighting(rows: dict[str, Row], console: Console) -> None:

@@ -170,7 +170,7 @@ def _curves(runs: list[EvaluatedRun]) -> dict[str, Any]:
 def _settings(runs: list[EvaluatedRun]) -> dict[str, list[tuple[str, list[str]]]]:
     """Settings that differ between runs, and those that all share."""
     keys = list(dict.fromkeys(key for run in runs for key in run.config))
-    rows = [(key, [_setting(run.config.get(key)) for run in runs]) for key in keys]
+    rows = [(key, [_setting(run.setting(key)) for run in runs]) for key in keys]
     return {
         "differing": [row for row in rows if len(set(row[1])) > 1],
         "shared": [row for row in rows if len(set(row[1])) == 1],

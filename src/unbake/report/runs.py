@@ -17,6 +17,8 @@ from unbake.training.run_folder import RunFolder
 
 #: Splits of the data in the order of the page.
 SHOWN_SPLITS = ("heldout", "train")
+#: The setting of which only methods with a radiance field make use.
+_SEARCHES = "roughness_search.times"
 TRAINING_VIEWS = 4  # shown on a page: a few suffice to see overfitting
 #: Of held-out views: most; least; and pictures of views of all runs, as all are in one file.
 HELDOUT_VIEWS, FEWEST_HELDOUT, HELDOUT_PICTURES = 24, 4, 48
@@ -42,6 +44,12 @@ class EvaluatedRun:
     def untrained(self) -> bool:
         """Whether nothing was learned."""
         return self.metrics.get("steps") == 0
+
+    def setting(self, key: str) -> Any:
+        """A setting by its dotted key, None where the run has none; searches as they are made."""
+        value = self.config.get(key)
+        searches = self.metrics.get("radiance", "") is not None  # old runs do not tell
+        return 0 if key == _SEARCHES and value and not searches else value
 
     def optimizes(self, quantity: str) -> bool:
         """Whether a quantity was unknown to the run, so that it has images or numbers of it."""
