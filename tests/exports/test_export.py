@@ -876,6 +876,16 @@ def test_usd_has_the_parts_and_the_recovered_materials(exported):
         assert mesh.GetDoubleSidedAttr().Get() == (name == "ground")
 
 
+def test_all_prims_of_usd_have_a_type(exported):
+    """Blender does not turn what is below a prim without one."""
+    from pxr import Usd, UsdGeom
+
+    stage = Usd.Stage.Open(str(exported.folder / "usd" / "scene.usdc"))
+    assert not [p.GetPath() for p in stage.Traverse() if not p.GetTypeName()]
+    meshes = [p for p in stage.Traverse() if p.IsA(UsdGeom.Mesh)]
+    assert meshes and all(p.GetParent().IsA(UsdGeom.Imageable) for p in meshes)
+
+
 def as_pixels(file):
     """A PNG file as (H, W, channels)."""
     pixels = np.array(mi.Bitmap(file))

@@ -127,7 +127,7 @@ class _Writer:
             turn = np.eye(4)
             turn[:3, :3] = up.rotation(up.of_usd).T  # rows are the images of the axes
             root.AddTransformOp().Set(Gf.Matrix4d(turn.tolist()))
-        for name in ("materials", "lights"):
+        for name in ("parts", "materials", "lights"):
             UsdGeom.Scope.Define(stage, f"/scene/{name}")
 
     def path(self, under: str, name: str) -> str:
