@@ -248,6 +248,8 @@ class Run:
         formats: str | Collection[str] = DEFAULT_FORMATS,
         *,
         texels: float | None = None,
+        metres_per_unit: float = 1.0,
+        cameras: bool = True,
         tell: Callable[[str], None] = print,
     ) -> dict[str, Any]:
         """Write textures, glTF, OpenUSD or a scene for Mitsuba; see `unbake.export`.
@@ -256,7 +258,14 @@ class Run:
             formats: one, or several.
         """
         return export(
-            self.path, out, formats, texels=texels, allow_outside=self._allow_outside, tell=tell
+            self.path,
+            out,
+            formats,
+            texels=texels,
+            metres_per_unit=metres_per_unit,
+            cameras=cameras,
+            allow_outside=self._allow_outside,
+            tell=tell,
         )
 
     def relight(

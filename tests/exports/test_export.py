@@ -35,9 +35,10 @@ from unbake.exports.bake import (
     own_opacities,
     own_textures,
 )
+from unbake.exports.cameras import Shot
 from unbake.exports.constants import Constants, material_constants
-from unbake.exports.gltf import Document
-from unbake.exports.lights import environment_picture, read_lights
+from unbake.exports.gltf import Document, write_glb
+from unbake.exports.lights import Light, environment_picture, read_lights
 from unbake.exports.mitsuba import write_scene
 from unbake.exports.observed import Views, filled, training_views
 from unbake.exports.parts import parsed_principled, read_parts
@@ -624,6 +625,141 @@ def test_files_stand_upright(up, taken, usd, told, tmp_path):
     )
 
 
+def in_gltf(document, wanted):
+    """What a node holds, by its key, with its matrix in the world, (4, 4), for all such nodes."""
+
+    def walked(numbers, around):
+        for node in (document["nodes"][number] for number in numbers):
+            own = np.eye(4)
+            if "matrix" in node:
+                own = np.array(node["matrix"]).reshape(4, 4).T
+            if "rotation" in node:
+                x, y, z, w = node["rotation"]
+                across = np.array([(0, -z, y), (z, 0, -x), (-y, x, 0)])
+                own[:3, :3] = np.eye(3) + 2 * w * across + 2 * across @ across
+            own = own @ np.diag([*node.get("scale", [1, 1, 1]), 1])
+            if wanted(node):
+                yield node, around @ own
+            yield from walked(node.get("children", []), around @ own)
+
+    return list(walked(document["scenes"][0]["nodes"], np.eye(4)))
+
+
+@pytest.mark.parametrize("metres", [1.0, 0.001])
+@pytest.mark.parametrize("up", [(0, 1, 0), leaning(25)])
+def test_cameras_of_files_see_what_those_of_the_data_set_see(up, metres, tmp_path):
+    from pxr import Gf, Usd, UsdGeom
+
+    given = [
+        replace(camera, fl_y=1.3 * camera.fl_x, height=11, cy=5.5) for camera in cameras_of(up)
+    ]
+    shot = Shot.of({f"a view/{i}": camera for i, camera in enumerate(given)}, [])
+    assert 0 < shot.near < 0.1 and shot.far > 20 and shot.off_centre() == 0
+    points = np.random.default_rng(0).normal(size=(50, 3)) * 0.4
+    write_glb(tmp_path / "scene.glb", None, [], [], [], Up.of(given), metres, shot)
+    document = document_of(tmp_path / "scene.glb")
+    found = in_gltf(document, lambda node: "camera" in node)
+    assert [node["name"] for node, _ in found] == [*shot.cameras]
+    upright = metres * points @ Up.of(given).rotation("Y").T
+    for camera, (node, world) in zip(given, found, strict=True):
+        np.testing.assert_allclose(world[:3, :3] @ world[:3, :3].T, np.eye(3), atol=1e-6)
+        x, y, z = ((upright - world[:3, 3]) @ world[:3, :3]).T
+        told = document["cameras"][node["camera"]]["perspective"]
+        high = np.tan(told["yfov"] / 2)
+        column = (1 - x / z / (high * told["aspectRatio"])) * camera.width / 2
+        row = (1 + y / z / high) * camera.height / 2
+        np.testing.assert_allclose(np.stack([column, row], 1), camera.project(points), atol=1e-3)
+        assert told["znear"] == pytest.approx(shot.near * metres)
+    off = {name: replace(camera, cx=5.0, cy=3.5) for name, camera in shot.cameras.items()}
+    shot = Shot.of(off, [])
+    assert shot.off_centre() == 2
+    write_usd(tmp_path, None, [], [], [], None, Up.of(given), metres, shot)
+    stage = Usd.Stage.Open(str(tmp_path / "scene.usdc"))
+    assert UsdGeom.GetStageMetersPerUnit(stage) == metres
+    cameras = [p for p in stage.Traverse() if p.IsA(UsdGeom.Camera)]
+    assert [prim.GetDisplayName() for prim in cameras] == [*off]
+    turn = UsdGeom.Xformable(stage.GetDefaultPrim()).ComputeLocalToWorldTransform(0)
+    for camera, prim in zip(off.values(), cameras, strict=True):
+        seen = UsdGeom.Camera(prim).GetCamera(0)
+        assert seen.horizontalAperture * Gf.Camera.APERTURE_UNIT * metres == pytest.approx(0.036)
+        matrix = seen.frustum.ComputeViewMatrix() * seen.frustum.ComputeProjectionMatrix()
+        x, y = np.array([matrix.Transform(turn.Transform(Gf.Vec3d(*p))) for p in points])[:, :2].T
+        pixels = np.stack([(1 + x) * camera.width / 2, (1 - y) * camera.height / 2], 1)
+        np.testing.assert_allclose(pixels, camera.project(points), atol=1e-3)
+
+
+def test_of_very_many_views_some_are_cameras(monkeypatch):
+    monkeypatch.setattr("unbake.exports.cameras.MOST", 2)
+    (camera, *_) = cameras_of((0, 1, 0))
+    shot = Shot.of({f"{i}": replace(camera, cx=4.0 + 0.3 * i) for i in range(5)}, [])
+    assert [*shot.cameras] == ["0", "3"]
+    notes = exporting._of_cameras(shot, 5, ["gltf", "usd"])
+    assert notes[0] == "2 of 5 views are cameras in glTF and usd"
+    assert notes[1].endswith("pictures are shifted by up to 0.9 pixels")
+    assert exporting._of_cameras(shot, 2, ["usd"]) == []
+
+
+def test_lights_are_as_bright_where_units_are_not_metres(tmp_path):
+    kinds = ("point", "spot", "directional")
+    lights = [
+        Light(kind, i, kind, (1.0, 2.0, 4.0), False, None, True, np.eye(4), (0.2, 0.4))
+        for i, kind in enumerate(kinds)
+    ]
+    up = Up.of(cameras_of((0, 1, 0)))
+    write_glb(tmp_path / "scene.glb", None, [], [], lights, up, 0.01)
+    document = document_of(tmp_path / "scene.glb")
+    made = document["extensions"]["KHR_lights_punctual"]["lights"]
+    assert [light["intensity"] for light in made] == pytest.approx([4e-4, 4e-4, 4])
+    assert [light["color"] for light in made] == [[0.25, 0.5, 1]] * 3
+    for _, world in in_gltf(document, lambda node: "extensions" in node):
+        np.testing.assert_allclose(world @ world.T, np.eye(4), atol=1e-9)
+    (note,) = exporting._of_strengths(lights, 0.01, ["usd"])
+    assert "by 0.0001" in note and note.endswith(": point, spot")
+    assert not exporting._of_strengths(lights, 1.0, ["usd"])
+    assert not exporting._of_strengths(lights[2:], 0.01, ["usd"])
+
+
+@pytest.mark.parametrize(
+    ("across", "metres", "told"),
+    [
+        (
+            6000,
+            1.0,
+            "the scene is 6000 m across: if units are millimetres, --metres-per-unit 0.001",
+        ),
+        (400, 1.0, "the scene is 400 m across: if units are centimetres, --metres-per-unit 0.01"),
+        (1e7, 1.0, "the scene is 10000000 m across: --metres-per-unit tells how long a unit is"),
+        (0.002, 1.0, "the scene is 0.002 m across: --metres-per-unit tells how long a unit is"),
+        (6, 0.001, "the scene is 0.006 m across: --metres-per-unit tells how long a unit is"),
+        (6000, 0.001, None),
+        (0.5, 1.0, None),
+        (150, 1.0, None),
+    ],
+)
+def test_scenes_whose_unit_may_be_another_are_told(across, metres, told):
+    part = SimpleNamespace(is_shown=True, triangles=triangle((0, 0, 0), (across, 0, 0), (0, 0, 0)))
+    for formats in (["gltf"], ["usd", "textures"]):
+        assert exporting._of_size([part], metres, formats) == ([] if told is None else [told])
+    assert not exporting._of_size([part], metres, ["mitsuba", "textures"])
+
+
+def test_units_and_cameras_are_as_wanted(exported, tmp_path, unbake, monkeypatch):
+    manifest = exported.manifest
+    assert manifest["metres_per_unit"] == 1 and manifest["cameras"] == ["view_0", "view_1"]
+    exported.use(monkeypatch)
+    words = ("--format", "gltf", "usd", "--texels", 2, "--metres-per-unit", 0.01, "--no-cameras")
+    outcome = unbake("export", exported.run, "--out", tmp_path / "out", *words)
+    assert outcome.status == 0, outcome.err
+    told = json.loads((tmp_path / "out" / "export.json").read_text())
+    assert told["metres_per_unit"] == 0.01 and told["cameras"] == []
+    document = document_of(tmp_path / "out" / "scene.glb")
+    (top,) = (document["nodes"][number] for number in document["scenes"][0]["nodes"])
+    assert top["scale"] == [0.01] * 3 and "cameras" not in document
+    assert all(set(node) >= {"mesh"} for node in document["nodes"] if node["name"] == "ground")
+    outcome = unbake("export", exported.run, "--out", tmp_path / "no", "--metres-per-unit", "nan")
+    assert outcome.status == 2 and "--metres-per-unit: must be a number" in outcome.err
+
+
 def test_the_environment_of_gltf_stands_upright(tmp_path):
     """What shines from a direction of the scene shines from where the node `upright` turns it."""
     picture = np.zeros((32, 64, 3), np.float32)
@@ -825,6 +961,7 @@ def test_gltf_has_the_lights(exported):
     (light,) = document["extensions"]["KHR_lights_punctual"]["lights"]
     assert light["type"] == "spot" and light["intensity"] == 4 and light["color"] == [0.25, 0.5, 1]
     (node,) = (n for n in document["nodes"] if "extensions" in n)
+    assert [camera["name"] for camera in document["cameras"]] == ["view_0", "view_1"]
     matrix = np.array(node["matrix"]).reshape(4, 4).T
     np.testing.assert_allclose(matrix[:3, 3], [1, -1, 1.5], atol=1e-5)
     ahead = np.array([-1, 1, -1.5]) / np.linalg.norm([-1, 1, -1.5])

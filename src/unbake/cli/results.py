@@ -125,6 +125,8 @@ def export(
     out: Out,
     format: Formats = exports.DEFAULT_FORMATS,
     texels: Annotated[float | None, arg(metavar="TEXELS", help_behavior_hint="")] = None,
+    metres_per_unit: Annotated[float, arg(metavar="METRES")] = 1.0,
+    cameras: Flag = True,
     allow_outside: Flag = False,
 ) -> None:
     """Write what a run recovered for other programs: textures, glTF, OpenUSD, or for Mitsuba.
@@ -143,6 +145,9 @@ def export(
         texels: Texels along a scene unit (default: one for each pixel of the training views on the
             surfaces, or more where what was recovered, or a known texture, is finer). A texture has
             from 64 to 8192 along an edge.
+        metres_per_unit: How long a unit of the scene is, in glTF and OpenUSD: 0.001 where it is a
+            millimetre.
+        cameras: Leave out the views of the data set, which are cameras in glTF and OpenUSD.
         allow_outside: Read files that the data set or its scene names outside of its folder.
     """
     backend.activate()
@@ -150,7 +155,8 @@ def export(
 
     console = Console(highlight=False)
     options: dict[str, Any] = {"allow_outside": allow_outside, "console": console, "tell": say}
-    run_export(run, out, format, texels=texels, **options)
+    options |= {"texels": texels, "metres_per_unit": metres_per_unit, "cameras": cameras}
+    run_export(run, out, format, **options)
     files = {"gltf": "scene.glb", "textures": "textures", "mitsuba": "mitsuba/scene.xml"}
     files |= {"usd": "usd/scene.usdc"}
     say(f"wrote {out}: {', '.join(files[name] for name in files if name in format)}, export.json")

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +39,7 @@ from ..transport.render import path_integrator
 from ..version import VERSION
 from . import DEFAULT_FORMATS, EXPORT_FORMAT, FORMATS, Format
 from .bake import WANTED, Baked, Baker, own_opacities, own_textures
+from .cameras import NO_SHOT, Shot
 from .constants import TEXTURED, constant_opacity, material_constants
 from .gltf import PUNCTUAL, write_glb
 from .lights import Light, environment_picture, read_lights, turned_latlong
@@ -58,6 +59,10 @@ _UPRIGHT = Path("environment_upright").with_suffix(".exr").name
 _UNOBSERVED = Path("environment_unobserved").with_suffix(".png").name
 #: Texels along the diagonal of a scene that no camera sees.
 _BLIND = 1024
+#: Metres across a scene from which its unit is told to be another, maybe.
+_SMALL, _LARGE = 0.01, 200.0
+#: Units that large scenes may have, metres, and what is no larger than a large room.
+_LENGTHS, _ROOM = {"centimetres": 0.01, "millimetres": 0.001}, 30.0
 #: Materials that are told one by one.
 _TOLD = 12
 #: BSDFs around others that are not written to glTF and OpenUSD, and what they give.
@@ -70,7 +75,10 @@ _LAYERS = {
 _COARSE = "without --texels, textures are as dense as it takes", "a larger --texels keeps more"
 
 _CONVENTIONS = {
-    "axes": "those of the scene; a node of glTF turns up to +y; it takes lengths as metres",
+    "axes": "those of the scene; a node of glTF turns up to +y, and scales units to metres",
+    "metres_per_unit": "how long a unit of the scene is: usd keeps units, and its stage says it",
+    "cameras": "views of the data set with the intrinsics and poses that the fit found, as glTF "
+    "and usd have them; in glTF the principal point is in the middle",
     "texture coordinates": "(0, 0) is the corner of the first texel of the first row of an image, "
     "in Mitsuba and in glTF",
     "roughness": "perceptual: GGX alpha = roughness squared",
@@ -83,7 +91,8 @@ _CONVENTIONS = {
     "opacity": "the alpha of the base colour, in glTF and in usd: cut-outs are solid from 0.5 on, "
     "and what is transparent to a part is blended",
     "metallic and roughness of glTF": "blue and green of one texture",
-    "light": "radiance and intensity in the scene's own units; glTF takes them as candela",
+    "light": "radiance and intensity in the scene's own units; glTF takes them as candela, where "
+    "an intensity has the square of metres_per_unit as a factor",
     "environment": "latitude and longitude as Mitsuba's envmap reads them without to_world: +y is "
     "the first row, -y the last one, +z the middle column, -z the left and right border, +x at a "
     "quarter of the width; linear RGB; in axes of the scene, and environment_upright in those of "
@@ -103,12 +112,24 @@ _CONVENTIONS = {
 }
 
 
+@dataclass(frozen=True)
+class _Wanted:
+    """What is wanted of an export; see there."""
+
+    formats: tuple[Format, ...]
+    texels: float | None
+    metres: float
+    cameras: bool
+
+
 def export(
     run: Path | str,
     out: Path | str,
     formats: str | Collection[str] = DEFAULT_FORMATS,
     *,
     texels: float | None = None,
+    metres_per_unit: float = 1.0,
+    cameras: bool = True,
     allow_outside: bool = False,
     console: Console | None = None,
     tell: Callable[[str], None] = print,
@@ -122,6 +143,8 @@ def export(
         texels: along a scene unit; None: one for each pixel of the training views on the surfaces,
             or more where the recovered fields or known textures hold finer detail, until 95 % of
             each surface differs from them by 2/255 at most, or is as solid where it is cut out.
+        metres_per_unit: how long a unit of the scene is, as glTF and OpenUSD have it.
+        cameras: write the views of the data set as cameras of glTF and OpenUSD.
         allow_outside: read files of the data set and its scene that lie outside of its folder.
         console: where a progress bar is shown, if it is a terminal; None: nowhere.
         tell: called with lines of progress.
@@ -135,18 +158,20 @@ def export(
     """
     run, out = Path(run), Path(out)
     formats = [formats] if isinstance(formats, str) else formats
-    chosen = _require_sound(run, out, formats, texels)
+    wanted = _require_sound(run, out, formats, _Wanted((), texels, metres_per_unit, cameras))
     recovered = load_run(run, allow_outside=allow_outside)
     with filled_folder(out) as partial:
-        manifest = _export(recovered, RunFolder(run), partial, chosen, texels, console, tell)
+        manifest = _export(recovered, RunFolder(run), partial, wanted, console, tell)
         write_json(partial / "export.json", manifest, allow_nan=False)
     return manifest
 
 
-def _require_sound(
-    run: Path, out: Path, formats: Collection[str], texels: float | None
-) -> tuple[Format, ...]:
-    """Check all that can be checked before anything is read; tells all mistakes at once."""
+def _require_sound(run: Path, out: Path, formats: Collection[str], wanted: _Wanted) -> _Wanted:
+    """Check all that can be checked before anything is read; tells all mistakes at once.
+
+    Returns:
+        What is wanted, with these formats.
+    """
     wrong: list[UserError] = []
     with collected(wrong):
         RunFolder(run).require_fitted()
@@ -159,22 +184,23 @@ def _require_sound(
     if "usd" in formats:
         with collected(wrong):
             require_usd()
-    if texels is not None and not 0 < texels < 1e9:
-        what = f"must be a positive number below 1e9, not {texels:g}"
-        wrong.append(UserError(what, "--texels"))
+    numbers = {"--texels": wanted.texels, "--metres-per-unit": wanted.metres}
+    for option, number in numbers.items():
+        if number is not None and not 1e-9 < number < 1e9:
+            wrong.append(UserError(f"must be a number from 1e-9 to 1e9, not {number:g}", option))
     raise_together(wrong, most=None)
-    return tuple(name for name in FORMATS if name in formats)
+    return replace(wanted, formats=tuple(name for name in FORMATS if name in formats))
 
 
 def _export(
     recovered: Recovered,
     folder: RunFolder,
     out: Path,
-    formats: Sequence[Format],
-    texels: float | None,
+    wanted: _Wanted,
     console: Console | None,
     tell: Callable[[str], None],
 ) -> dict[str, Any]:
+    formats, texels = wanted.formats, wanted.texels
     problem, dataset = recovered.problem, recovered.dataset
     tell_changed_geometry(folder, dataset, tell)
     cameras = recovered.cameras
@@ -188,9 +214,9 @@ def _export(
     lights = read_lights(found.scene, problem)
     learned = () if problem.materials is None else tuple(problem.materials)
     of_lamps = "mitsuba" in formats and bool(learned)
-    wanted = [p for p in found.parts if p.is_optimized or of_lamps]
+    placed = [p for p in found.parts if p.is_optimized or of_lamps]
     with _Bar(console) as bar:
-        atlases = make_atlases(found.scene, wanted, density, bar.unwraps)
+        atlases = make_atlases(found.scene, placed, density, bar.unwraps)
         bar.total(sum(atlas.resolution**2 for atlas in atlases))
         baker, known = _baker(recovered, atlases, learned), set(formats) != {"mitsuba"}
         baked = []
@@ -201,9 +227,7 @@ def _export(
             baked.append(baker.bake(atlas, bar.advance, refine=refine, known=shown))
         bar.says("writing …")
         environment = environment_picture(problem)
-        written = _write(
-            recovered, out, formats, found, baked, lights, environment, learned, texels is None
-        )
+        written = _write(recovered, out, wanted, found, baked, lights, environment, learned)
     names = {id(placed.part): atlas.name for atlas in atlases for placed in atlas.placed}
     manifest = {
         "format": EXPORT_FORMAT,
@@ -216,6 +240,7 @@ def _export(
         "formats": list(formats),
         "learned": list(learned),
         "texels_per_unit": density,
+        "metres_per_unit": wanted.metres,
         "unobserved_share": _unobserved(baked),
         "near": _near(baked),
         "files": sorted(p.relative_to(out).as_posix() for p in out.rglob("*") if p.is_file()),
@@ -231,6 +256,7 @@ def _export(
             }
             for light in lights
         ],
+        "cameras": written.cameras,
         "environment": None if environment is None else _ENVIRONMENT,
         "environment_upright": _UPRIGHT if (out / _UPRIGHT).exists() else None,
         "environment_unobserved": _UNOBSERVED if (out / _UNOBSERVED).exists() else None,
@@ -241,8 +267,9 @@ def _export(
             *_without_place(found, baked, formats, learned),
             *_of_lamps(found, formats, learned),
             *_of_coordinates(baked, formats),
-            *_of_strengths(lights, formats),
+            *_of_strengths(lights, wanted.metres, formats),
             *_of_axes([view.camera for view in dataset.train], formats),
+            *_of_size(found.parts, wanted.metres, formats),
             *written.notes,
         ],
     }
@@ -268,21 +295,21 @@ class _Written:
     textures: dict[str, list[str]]  #: names of files, by material
     masks: dict[str, str]  #: of what no training view saw, by material
     notes: list[str]  #: what is not as it was
+    cameras: list[str]  #: names of views that became cameras
 
 
 def _write(
     recovered: Recovered,
     out: Path,
-    formats: Sequence[Format],
+    wanted: _Wanted,
     found: Parts,
     baked: Sequence[Baked],
     lights: Sequence[Light],
     environment: Any,
     learned: Sequence[str],
-    refine: bool,
 ) -> _Written:
     """Write all formats."""
-    dataset = recovered.dataset
+    dataset, formats = recovered.dataset, wanted.formats
     shown = [one for one in baked if one.atlas.is_optimized]
     files: dict[str, list[str]] = {}
     notes: list[str] = []
@@ -307,13 +334,15 @@ def _write(
         hidden = named([part.name for part in found.parts if not part.is_shown])
         notes.append(f"glTF and usd have no surfaces that nobody sees (null): without {hidden}")
     up = Up.of([view.camera for view in dataset.train])
+    shot = _shot(recovered, visible) if wanted.cameras and others else NO_SHOT
+    notes += _of_cameras(shot, len(dataset.views), formats)
     if "gltf" in formats:
-        write_glb(out / "scene.glb", found.scene, visible, shown, lights, up)
+        write_glb(out / "scene.glb", found.scene, visible, shown, lights, up, wanted.metres, shot)
         notes += _environment_of_gltf(out, environment, up, formats)
     if "usd" in formats:
         (out / "usd").mkdir()
         beside = None if environment is None else f"../{_ENVIRONMENT}"
-        write_usd(out / "usd", found.scene, visible, shown, lights, beside, up)
+        write_usd(out / "usd", found.scene, visible, shown, lights, beside, up, wanted.metres, shot)
     if "mitsuba" in formats:
         (out / "mitsuba").mkdir()
         # The scene's own stays as it is.
@@ -328,10 +357,46 @@ def _write(
             recovered_environment,
             recovered.camera(dataset.train[0]),
             integrator=path_integrator(recovered.problem.scene_view.scene),
-            refine=refine,
+            refine=wanted.texels is None,
         )
         notes += scene.notes
-    return _Written(files, masks, notes)
+    return _Written(files, masks, notes, list(shot.cameras))
+
+
+def _shot(recovered: Recovered, parts: Sequence[Part]) -> Shot:
+    """The cameras of all views, as the fit found them."""
+    views = recovered.dataset.views
+    return Shot.of({view.name: recovered.camera(view) for view in views}, parts)
+
+
+def _of_cameras(shot: Shot, views: int, formats: Sequence[Format]) -> list[str]:
+    """Which cameras are not as they were."""
+    if not shot.cameras:
+        return []
+    notes = []
+    if len(shot.cameras) < views:
+        notes.append(f"{len(shot.cameras)} of {views} views are cameras in glTF and usd")
+    if "gltf" in formats and (off := shot.off_centre()):
+        what = "glTF has the principal point of cameras in the middle"
+        notes.append(f"{what}: pictures are shifted by up to {off:.1f} pixels")
+    return notes
+
+
+def _of_size(parts: Sequence[Part], metres: float, formats: Sequence[Format]) -> list[str]:
+    """That a scene is so large or small that its unit may be another."""
+    ends = [end(p.triangles.positions, 0) for p in parts if p.is_shown for end in (np.min, np.max)]
+    if not ends or not {"gltf", "usd"} & set(formats):
+        return []
+    units = float(np.linalg.norm(np.ptp(ends, axis=0)))
+    if _SMALL <= units * metres <= _LARGE:
+        return []
+    remedy = "--metres-per-unit tells how long a unit is"
+    for name, length in _LENGTHS.items():
+        if units * metres > _LARGE and units * length < _ROOM:
+            remedy = f"if units are {name}, --metres-per-unit {length:g}"
+            break
+    across = f"{units * metres:.0f}" if units * metres > _LARGE else f"{units * metres:.2g}"
+    return [f"the scene is {across} m across: {remedy}"]
 
 
 def _environment_of_gltf(
@@ -362,13 +427,22 @@ def _of_coordinates(baked: Sequence[Baked], formats: Sequence[Format]) -> list[s
     return [f"{what}; add gltf, usd or mitsuba to --format for meshes that have them"]
 
 
-def _of_strengths(lights: Sequence[Light], formats: Sequence[Format]) -> list[str]:
-    """Which lights Blender divides by 683, unless it is told not to; it does not divide lamps."""
-    names = [light.name for light in lights if light.plugin in PUNCTUAL and light.strength]
-    if "gltf" not in formats or not names:
-        return []
-    what = "in Blender, import scene.glb with Lighting Mode: Unitless"
-    return [f"{what}, for {named(names)}"]
+def _of_strengths(lights: Sequence[Light], metres: float, formats: Sequence[Format]) -> list[str]:
+    """Which lights Blender takes for others.
+
+    It divides those of glTF by 683, unless it is told not to, but not lamps; and it scales places
+    of a stage to metres, but not intensities.
+    """
+    lit = [light for light in lights if light.plugin in PUNCTUAL and light.strength]
+    notes = []
+    if "gltf" in formats and lit:
+        what = "in Blender, import scene.glb with Lighting Mode: Unitless"
+        notes.append(f"{what}, for {named([light.name for light in lit])}")
+    scaled = [light.name for light in lit if light.plugin != "directional"]
+    if "usd" in formats and metres != 1 and scaled:
+        what = f"in Blender, multiply the power of lights of scene.usdc by {metres**2:g}"
+        notes.append(f"{what}, which it does not scale: {named(scaled)}")
+    return notes
 
 
 def _of_axes(cameras: Sequence[Camera], formats: Sequence[Format]) -> list[str]:

@@ -1,8 +1,9 @@
 """The scene as one binary glTF 2.0 file: a node for each part, textures and lights inside of it.
 
 Texture coordinates are the same in Mitsuba and in glTF: (0, 0) is the corner of the first texel of
-the first row. Positions and units are those of the scene. glTF takes +y as up, and metres: a node
-around all others turns what is up in the scene to +y.
+the first row. Positions are those of the scene. glTF takes +y as up, and metres: a node around all
+others turns what is up in the scene to +y, and scales a unit of the scene to metres. Cameras and
+lights below it have the inverse scale, so that none is left in the world.
 
 Source: Khronos, glTF 2.0 specification; KHR_lights_punctual, KHR_materials_emissive_strength,
 KHR_materials_transmission, KHR_materials_ior, KHR_materials_clearcoat.
@@ -29,6 +30,7 @@ from ..scene.parse import ParsedScene
 from ..scene.triangles import unit
 from ..version import VERSION
 from .bake import Baked
+from .cameras import NO_SHOT, Shot
 from .constants import CUTOFF, Constants, constant_opacity, is_number, material_constants
 from .lights import Light
 from .parts import Part
@@ -47,7 +49,7 @@ _ALPHA = 0.1
 #: Lights without extent, as glTF calls them.
 PUNCTUAL = {"point": "point", "spot": "spot", "directional": "directional"}
 
-#: The node that turns the scene, where its up is not +y.
+#: The node that turns and scales the scene, where its up is not +y or its unit no metre.
 UPRIGHT = "upright"
 #: Bytes that the header of a file can tell.
 LARGEST = 2**32 - 1
@@ -72,13 +74,19 @@ class Document:
         entries.append(entry)
         return len(entries) - 1
 
-    def turn(self, up: Up) -> None:
-        """Put a node around all that there is, which turns up to +y, where it is not."""
-        if not up.is_turned("Y"):
-            return
-        rotation, top = up.quaternion("Y").tolist(), self.json["scenes"][0]
-        node = {"name": UPRIGHT, "rotation": rotation, "children": top["nodes"]}
-        top["nodes"] = [self.add("nodes", node)]
+    def turn(self, up: Up, metres: float = 1.0) -> None:
+        """Put a node around all that there is, which turns up to +y, and scales a unit to metres.
+
+        There is none where there is nothing to turn or to scale.
+        """
+        node: dict[str, Any] = {"name": UPRIGHT}
+        if up.is_turned("Y"):
+            node["rotation"] = up.quaternion("Y").tolist()
+        if metres != 1:
+            node["scale"] = [metres] * 3
+        top = self.json["scenes"][0]
+        if len(node) > 1 and top["nodes"]:
+            top["nodes"] = [self.add("nodes", node | {"children": top["nodes"]})]
 
     def use(self, extension: str) -> str:
         """Declare an extension."""
@@ -165,8 +173,10 @@ def write_glb(
     baked: Sequence[Baked],
     lights: Sequence[Light],
     up: Up,
+    metres: float = 1.0,
+    shot: Shot = NO_SHOT,
 ) -> None:
-    """Write parts, their materials and the lights.
+    """Write parts, their materials, the lights and cameras.
 
     Args:
         path: the file.
@@ -176,6 +186,8 @@ def write_glb(
         lights: point, spot and directional lights are written as such, area lights as emission of
             their parts; environments are left out, as glTF knows none.
         up: what is up in the scene.
+        metres: of a unit of the scene.
+        shot: the cameras; principal points are taken as in the middle of images.
     """
     document = Document()
     placed = {id(p.part): (p.triangles, b) for b in baked for p in b.atlas.placed}
@@ -201,8 +213,10 @@ def write_glb(
         _add_part(document, part.name, triangles, materials[key])
     for light in lights:
         if light.plugin in PUNCTUAL and light.strength is not None:
-            _add_light(document, light)
-    document.turn(up)
+            _add_light(document, light, metres)
+    if shot.cameras:
+        _add_cameras(document, shot, metres)
+    document.turn(up, metres)
     document.write(path)
 
 
@@ -353,15 +367,18 @@ def _emissive(document: Document, strength: Sequence[float]) -> Mapping[str, Any
     }
 
 
-def _add_light(document: Document, light: Light) -> None:
-    """A light without extent; glTF's look along -z, Mitsuba's along +z."""
+def _add_light(document: Document, light: Light, metres: float) -> None:
+    """A light without extent; glTF's look along -z, Mitsuba's along +z.
+
+    Its irradiance stays the same where a unit becomes so many metres.
+    """
     assert light.strength is not None
     largest = max(*light.strength, 1e-12)
     entry: dict[str, Any] = {
         "name": light.name,
         "type": PUNCTUAL[light.plugin],
         "color": [max(x, 0.0) / largest for x in light.strength],
-        "intensity": largest,
+        "intensity": largest * (1.0 if light.plugin == "directional" else metres**2),
     }
     if light.plugin == "spot":
         inner, outer = light.angles
@@ -375,7 +392,31 @@ def _add_light(document: Document, light: Light) -> None:
     known["lights"].append(entry)
     node = {
         "name": light.name,
-        "matrix": light.pose.T.ravel().tolist(),
+        "matrix": _unscaled(light.pose, metres),
         "extensions": {extension: {"light": len(known["lights"]) - 1}},
     }
     document.json["scenes"][0]["nodes"].append(document.add("nodes", node))
+
+
+def _add_cameras(document: Document, shot: Shot, metres: float) -> None:
+    """Cameras of glTF look along -z, as those of a data set; a node has all of them."""
+    children = []
+    for name, camera in shot.cameras.items():
+        wide, high = camera.width / camera.fl_x, camera.height / camera.fl_y
+        perspective = {
+            "aspectRatio": wide / high,
+            "yfov": 2 * math.atan(high / 2),
+            "znear": shot.near * metres,
+            "zfar": shot.far * metres,
+        }
+        made = {"name": name, "type": "perspective", "perspective": perspective}
+        number, matrix = document.add("cameras", made), _unscaled(camera.to_world, metres)
+        node = {"name": name, "camera": number, "matrix": matrix}
+        children.append(document.add("nodes", node))
+    top = document.add("nodes", {"name": "cameras", "children": children})
+    document.json["scenes"][0]["nodes"].append(top)
+
+
+def _unscaled(pose: np.ndarray, metres: float) -> list[float]:
+    """The matrix of a node whose scale in the world is 1, where the node around it has metres."""
+    return (pose @ np.diag([1 / metres] * 3 + [1.0])).T.ravel().tolist()

@@ -1,13 +1,13 @@
-"""The scene as OpenUSD: meshes, UsdPreviewSurface materials with textures, and lights.
+"""The scene as OpenUSD: meshes, UsdPreviewSurface materials with textures, lights and cameras.
 
     usd/scene.usdc        binary; names of parts and materials are display names
     usd/textures/         PNG, sRGB for albedo; and the environment
 
 A texture coordinate (u, v) of Mitsuba and glTF is (u, 1 − v) in USD: (0, 0) is below. Units
-stay those of the scene, and so do axes where y or z is up: the stage says which. Where neither is,
-`/scene` turns what is up to the nearer of the two.
+stay those of the scene, and so do axes where y or z is up: the stage says which, and how long a
+unit is. Where neither is up, `/scene` turns what is to the nearer of the two.
 
-Source: Pixar, OpenUSD: UsdGeom, UsdShade, UsdPreviewSurface 2.6, UsdLux.
+Source: Pixar, OpenUSD: UsdGeom, UsdShade, UsdPreviewSurface 2.6, UsdLux; GfCamera.
 """
 
 from __future__ import annotations
@@ -23,11 +23,13 @@ from typing import Any
 
 import numpy as np
 
+from ..dataset.camera import Camera
 from ..errors import UserError
 from ..imaging.pictures import write_png
 from ..scene.parse import ParsedScene
 from ..scene.triangles import unit
 from .bake import Baked
+from .cameras import NO_SHOT, Shot
 from .constants import CUTOFF, Constants, material_constants
 from .gltf import Document, plain_material
 from .lights import Light
@@ -44,6 +46,8 @@ _INPUTS = {
 }
 #: A light without extent is a small sphere, whose size its intensity does not depend on.
 _RADIUS = 1e-3
+#: Of all cameras, metres: the width of film, of which only its share of the focal length counts.
+_FILM = 0.036
 
 
 def require_usd() -> None:
@@ -65,8 +69,10 @@ def write_usd(
     lights: Sequence[Light],
     environment: str | None,
     up: Up,
+    metres: float = 1.0,
+    shot: Shot = NO_SHOT,
 ) -> None:
-    """Write parts, their materials and the lights.
+    """Write parts, their materials, the lights and cameras.
 
     Args:
         folder: to write to; it exists.
@@ -77,12 +83,14 @@ def write_usd(
         environment: path of the environment's file from the folder, which is copied to the
             textures; None: there is none.
         up: what is up in the scene.
+        metres: of a unit of the scene.
+        shot: the cameras.
     """
     from pxr import Usd, UsdGeom, UsdLux
 
     stage = Usd.Stage.CreateNew(os.fspath(folder / "scene.usdc"))
     UsdGeom.SetStageUpAxis(stage, up.of_usd)
-    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    UsdGeom.SetStageMetersPerUnit(stage, metres)
     writer = _Writer(stage, up)
     stems = file_names([one.atlas.name for one in baked])
     placed, textured = {}, {}
@@ -102,6 +110,8 @@ def write_usd(
     for light in lights:
         if light.strength is not None:
             writer.light(light)
+    for name, camera in shot.cameras.items():
+        writer.camera(name, camera, (shot.near, shot.far), metres)
     if environment is not None:
         dome = UsdLux.DomeLight.Define(stage, writer.path("lights", "environment"))
         copied = f"textures/{Path(environment).name}"
@@ -127,7 +137,7 @@ class _Writer:
             turn = np.eye(4)
             turn[:3, :3] = up.rotation(up.of_usd).T  # rows are the images of the axes
             root.AddTransformOp().Set(Gf.Matrix4d(turn.tolist()))
-        for name in ("parts", "materials", "lights"):
+        for name in ("parts", "materials", "lights", "cameras"):
             UsdGeom.Scope.Define(stage, f"/scene/{name}")
 
     def path(self, under: str, name: str) -> str:
@@ -264,6 +274,32 @@ class _Writer:
             shaping.CreateShapingConeSoftnessAttr(1 - min(inner / max(outer, 1e-9), 1.0))
         made.GetPrim().SetDisplayName(light.name)
         UsdGeom.Xformable(made).AddTransformOp().Set(Gf.Matrix4d(light.pose.T.tolist()))
+
+    def camera(
+        self, name: str, camera: Camera, clipped: tuple[float, float], metres: float
+    ) -> None:
+        """Add a camera: USD's look along -z, as those of a data set.
+
+        Args:
+            name: of its view.
+            camera: the camera.
+            clipped: what is nearer and farther, world units.
+            metres: of a unit.
+        """
+        from pxr import Gf, UsdGeom
+
+        made = UsdGeom.Camera.Define(self._stage, self.path("cameras", name))
+        made.GetPrim().SetDisplayName(name)
+        across = 10 * _FILM / metres  # lengths of film are tenths of units
+        focal = across * camera.fl_x / camera.width
+        x, y = focal / camera.fl_x, focal / camera.fl_y  # of a pixel
+        made.CreateFocalLengthAttr(focal)
+        made.CreateHorizontalApertureAttr(x * camera.width)
+        made.CreateVerticalApertureAttr(y * camera.height)
+        made.CreateHorizontalApertureOffsetAttr(x * (camera.width / 2 - camera.cx))
+        made.CreateVerticalApertureOffsetAttr(y * (camera.cy - camera.height / 2))
+        made.CreateClippingRangeAttr(Gf.Vec2f(*clipped))
+        made.AddTransformOp().Set(Gf.Matrix4d(camera.to_world.T.tolist()))
 
     def _material(self, name: str) -> tuple[Any, Any]:
         """A material and its surface shader."""
