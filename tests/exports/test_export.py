@@ -366,6 +366,7 @@ def test_a_scene_without_an_integrator_gets_one(tmp_path):
     own = made.path.read_text().replace('type="path"', 'type="direct"')
     assert own.count("<integrator") == 1
     (tmp_path / "own.xml").write_text(own)
+    assert sensor.sampler().sample_count() == 64
     (tmp_path / "again").mkdir()
     scene, scratch = (parsed_principled(tmp_path / "own.xml", tmp_path) for _ in range(2))
     made = write_scene(tmp_path / "again", scene, scratch, [], [], [], None, camera)

@@ -25,6 +25,8 @@ from .unwrap import Placed
 
 #: How bitmaps are looked up that do not say it.
 _LOOKED_UP = {"wrap_mode": "repeat", "filter_type": "bilinear"}
+#: Samples a pixel of a sensor that is added.
+_SPP = 64
 _TEXTURES, _MESHES, _ENVIRONMENT, _LIGHTS = "textures", "meshes", "environment", "lights"
 
 
@@ -396,7 +398,9 @@ def _require_sensor(scene: ParsedScene, camera: Camera) -> list[str]:
         notes.append(f"the sensor has the mean of two focal lengths, {told}")
         mean = (camera.fl_x + camera.fl_y) / 2
         camera = replace(camera, fl_x=mean, fl_y=mean)
-    wanted = camera.sensor(64)
+    wanted = camera.sensor(_SPP)
+    sampler = mi.parser.SceneNode()
+    sampler.type = mi.ObjectType.Sampler
     film = mi.parser.SceneNode()
     film.type = mi.ObjectType.Film
     film.props.set_plugin_name("hdrfilm")
@@ -407,7 +411,13 @@ def _require_sensor(scene: ParsedScene, camera: Camera) -> list[str]:
     for key, value in wanted.items():
         if key not in ("type", "film", "sampler"):
             sensor.props[key] = value
+    for key, value in wanted["sampler"].items():
+        if key == "type":
+            sampler.props.set_plugin_name(value)
+        else:
+            sampler.props[key] = value
     sensor.props["film"] = mi.Properties.ResolvedReference(scene.append(film))
+    sensor.props["sampler"] = mi.Properties.ResolvedReference(scene.append(sampler))
     scene.append_to_root("exported sensor", sensor)
     return notes
 
