@@ -220,6 +220,24 @@ def test_parts_keep_names_and_places(mixed):
     assert not parts["ball"].exact and parts["ground"].exact
 
 
+#: Two groups, of one shape and of two, and instances of them with and without ids.
+PLACED = """<scene version="3.0.0">
+  <shape type="shapegroup" id="seat"><shape type="rectangle" id="cushion"/></shape>
+  <shape type="shapegroup" id="set"><shape type="cube" id="plate"/>
+    <shape type="rectangle" id="cup"/></shape>
+  <shape type="instance" id="armchair"><ref id="seat"/></shape>
+  <shape type="instance"><ref id="seat"/></shape>
+  <shape type="instance" id="for guests"><ref id="set"/></shape>
+  <shape type="instance"><ref id="set"/></shape>
+  <emitter type="constant"/></scene>"""
+
+
+def test_instances_have_their_own_names(tmp_path):
+    (tmp_path / "scene.xml").write_text(PLACED)
+    names = {part.name for part in read_parts(tmp_path / "scene.xml", tmp_path).parts}
+    assert names == {"armchair", "cushion", "for guests/plate", "for guests/cup", "plate", "cup"}
+
+
 def test_parts_are_where_mitsuba_has_them(mixed, tmp_path):
     """Distance, normals of both kinds and texture coordinates, of flipped and mirrored ones too."""
     original = parsed_principled(mixed, mixed.parent).instantiate(merge=False)

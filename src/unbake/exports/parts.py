@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -29,7 +30,9 @@ _ID = "shape node {}"
 class Part:
     """A shape of the scene, once for each place that it stands at."""
 
-    name: str  #: unique: its id, else the name of its file, else its plugin and a number
+    #: Unique: its id, else the name of its file, else its plugin and a number; of what an instance
+    #: places, the instance's id where it has one, with that behind it in a group of several shapes.
+    name: str
     node: int  #: among the nodes of the parsed scene
     bsdf: int | None  #: the node of its outermost BSDF
     emitter: int | None  #: the node of its emitter
@@ -95,8 +98,15 @@ def read_parts(path: Path, root: Path, pieces: Pieces | None = None) -> Parts:
     numbers = {_ID.format(i): i for i in names}
     parts, left_out = [], []
     taken: set[str] = set()
-    for placed in placed_shapes(made):
+    everything = placed_shapes(made)
+    together = Counter(each.instance.id() for each in everything if each.instance is not None)
+    for placed in everything:
         i = numbers[placed.shape.id()]
+        name = names[i]
+        if placed.instance is not None:
+            by = placed.instance.id()
+            if chosen := chosen_id(nodes[numbers[by]]):
+                name = chosen if together[by] == 1 else f"{chosen}/{name}"
         triangles = _triangles(placed, nodes[i].props)
         if triangles is None:
             left_out.append(names[i])
@@ -107,7 +117,7 @@ def read_parts(path: Path, root: Path, pieces: Pieces | None = None) -> Parts:
             continue
         part = replace(
             described[i],
-            name=_unique(names[i], taken),
+            name=_unique(name, taken),
             triangles=sound,
             exact=placed.shape.is_mesh(),
             instanced=placed.to_world is not None,

@@ -18,6 +18,7 @@ class PlacedShape:
 
     shape: mi.Shape
     to_world: np.ndarray | None  #: (4, 4), of the instance; None: there is none
+    instance: mi.Shape | None = None  #: that places it
 
 
 def registry_number(shape: mi.Shape) -> int:
@@ -51,7 +52,7 @@ def placed_shapes(scene: mi.Scene) -> list[PlacedShape]:
         if name is None or name[1] not in groups:
             raise ValueError(f"an instance of no known group: {shape}")
         matrix = np.array(mi.traverse(shape)["to_world"].matrix, dtype=np.float64).reshape(4, 4)
-        placed += [PlacedShape(one, matrix) for one in groups[name[1]]]
+        placed += [PlacedShape(one, matrix, shape) for one in groups[name[1]]]
     return placed
 
 
