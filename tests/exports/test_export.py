@@ -366,6 +366,7 @@ def test_a_scene_without_a_sensor_gets_that_of_the_first_photograph(aspect, tmp_
     scene, scratch = (parsed_principled(tmp_path / "scene.xml", tmp_path) for _ in range(2))
     made = write_scene(tmp_path / "out", scene, scratch, [], [], [], None, wanted)
     (sensor,) = mi.load_file(str(made.path)).sensors()
+    assert sensor.sampler().sample_count() == 64
     found = Camera.from_mitsuba(sensor)
     assert [found.cx, found.cy, found.width, found.height] == pytest.approx([35, 21, 64, 48])
     np.testing.assert_allclose(found.to_world, wanted.to_world, atol=1e-5)
@@ -384,7 +385,6 @@ def test_a_scene_without_an_integrator_gets_one(tmp_path):
     own = made.path.read_text().replace('type="path"', 'type="direct"')
     assert own.count("<integrator") == 1
     (tmp_path / "own.xml").write_text(own)
-    assert sensor.sampler().sample_count() == 64
     (tmp_path / "again").mkdir()
     scene, scratch = (parsed_principled(tmp_path / "own.xml", tmp_path) for _ in range(2))
     made = write_scene(tmp_path / "again", scene, scratch, [], [], [], None, camera)
@@ -899,10 +899,10 @@ def test_constants_beyond_what_any_material_has_are_limited(given, ior, tmp_path
     assert 0 <= found.clearcoat <= 1 and 0 < found.clearcoat_roughness <= 0.1**0.5 + 1e-9
 
 
-def plain(plugin, given, folder):
+def plain(plugin, given, folder, shape="rectangle"):
     """The glTF material of a known BSDF with these parameters."""
     (folder / "scene.xml").write_text(
-        f'''<scene version="3.0.0"><shape type="rectangle"><bsdf type="{plugin}">{given}</bsdf>
+        f'''<scene version="3.0.0"><shape type="{shape}"><bsdf type="{plugin}">{given}</bsdf>
           </shape><emitter type="constant"/></scene>'''
     )
     found = read_parts(folder / "scene.xml", folder)
@@ -963,6 +963,23 @@ def test_known_glass_has_the_index_of_its_name(tmp_path):
     assert material["extensions"]["KHR_materials_ior"]["ior"] == pytest.approx(2.419, abs=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("plugin", "shape", "thickness"),
+    [
+        ("dielectric", "cube", 2.0),
+        ("roughdielectric", "cube", 2.0),
+        ("dielectric", "rectangle", 0.02),
+        ("thindielectric", "cube", None),
+        ("conductor", "cube", None),
+    ],
+)
+def test_solid_glass_has_a_thickness_and_panes_have_none(plugin, shape, thickness, tmp_path):
+    made = plain(plugin, "", tmp_path, shape).get("extensions", {})
+    assert ("KHR_materials_transmission" in made) == (plugin != "conductor")
+    told = None if thickness is None else {"thicknessFactor": pytest.approx(thickness)}
+    assert made.get("KHR_materials_volume") == told
+
+
 @pytest.mark.parametrize("kind", ["usd", "mitsuba"])
 def test_masks_of_what_no_view_saw_come_with_all_formats(kind, exported, tmp_path, monkeypatch):
     exported.use(monkeypatch)
@@ -976,6 +993,7 @@ def test_masks_of_what_no_view_saw_come_with_all_formats(kind, exported, tmp_pat
 def test_gltf_has_the_lights(exported):
     document = document_of(exported.folder / "scene.glb")
     used = {"KHR_lights_punctual", "KHR_materials_emissive_strength", "KHR_materials_transmission"}
+    used |= {"KHR_materials_volume"}
     assert used <= set(document["extensionsUsed"])
     (light,) = document["extensions"]["KHR_lights_punctual"]["lights"]
     assert light["type"] == "spot" and light["intensity"] == 4 and light["color"] == [0.25, 0.5, 1]

@@ -6,7 +6,7 @@ others turns what is up in the scene to +y, and scales a unit of the scene to me
 lights below it have the inverse scale, so that none is left in the world.
 
 Source: Khronos, glTF 2.0 specification; KHR_lights_punctual, KHR_materials_emissive_strength,
-KHR_materials_transmission, KHR_materials_ior, KHR_materials_clearcoat.
+KHR_materials_transmission, KHR_materials_volume, KHR_materials_ior, KHR_materials_clearcoat.
 """
 
 from __future__ import annotations
@@ -288,6 +288,9 @@ def plain_material(
         factors["baseColorFactor"] = [*_colour(glass.get("specular_transmittance", 1.0), 1.0), 1.0]
         material["extensions"] = {transmission: {"transmissionFactor": 1.0}}
         material["extensions"] |= _refraction(document, glass, 1.5046)
+        if not part.is_pane:
+            volume = document.use("KHR_materials_volume")
+            material["extensions"][volume] = {"thicknessFactor": _thickness(part.triangles)}
     elif metal := next((props[k] for k in _CONDUCTORS if k in props), None):
         factors["metallicFactor"] = 1.0
         factors["roughnessFactor"] = _roughness(metal, "roughconductor")
@@ -305,6 +308,15 @@ def plain_material(
         material["alphaMode"] = "BLEND"
     material["pbrMetallicRoughness"] = factors
     return material
+
+
+def _thickness(triangles: Triangles) -> float:
+    """About how thick a solid is, in units of the scene: the least edge of its box.
+
+    It is more than 0, also of the surface of a pond: glTF takes what has no thickness as a pane.
+    """
+    edges = np.ptp(triangles.positions, axis=0)
+    return float(max(edges.min(), 0.01 * edges.max()))
 
 
 def _refraction(document: Document, props: Any, default: float) -> dict[str, Any]:
