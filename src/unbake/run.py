@@ -23,7 +23,7 @@ from .exports.bake import Baker
 from .exports.export import DEFAULT_FORMATS, export
 from .exports.observed import Views, training_views
 from .exports.parts import Part, read_parts
-from .exports.unwrap import Placed
+from .exports.unwrap import LARGEST, Placed
 from .fields.materials import Materials
 from .quantities import QUANTITIES
 from .report.page import write_report
@@ -248,6 +248,7 @@ class Run:
         formats: str | Collection[str] = DEFAULT_FORMATS,
         *,
         texels: float | None = None,
+        max_texture: int = LARGEST,
         metres_per_unit: float = 1.0,
         cameras: bool = True,
         tell: Callable[[str], None] = print,
@@ -262,6 +263,7 @@ class Run:
             out,
             formats,
             texels=texels,
+            max_texture=max_texture,
             metres_per_unit=metres_per_unit,
             cameras=cameras,
             allow_outside=self._allow_outside,

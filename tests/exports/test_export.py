@@ -2292,7 +2292,49 @@ def test_one_format_needs_no_list(tmp_path):
         exporting.export(tmp_path / "none", tmp_path / "out", "obj")
 
 
-@pytest.mark.parametrize("words", [{"formats": ["obj"]}, {"texels": -1.0}, {"formats": []}])
+@pytest.mark.parametrize(
+    ("given", "unknown", "meant"),
+    [
+        (["gltf,usd"], None, None),
+        ("gltf, textures,", None, None),
+        (["gtlf,usd", "texture"], "'gtlf', 'texture'", "gltf textures"),
+        (["xyz"], "'xyz'", None),
+    ],
+)
+def test_formats_may_have_commas_and_the_nearest_is_told(given, unknown, meant, tmp_path, unbake):
+    words = [given] if isinstance(given, str) else given
+    outcome = unbake("export", tmp_path / "none", "--out", tmp_path / "out", "--format", *words)
+    assert outcome.status == 2 and "no run" in outcome.err
+    assert (f"no format named {unknown}" in outcome.err) == (unknown is not None)
+    assert (f"Did you mean {meant}? There are gltf" in outcome.err) == (meant is not None)
+    with pytest.raises(UserError, match="no run") as error:
+        exporting.export(tmp_path / "none", tmp_path / "out", given)
+    assert ("no format" in str(error.value)) == (unknown is not None)
+
+
+def test_textures_have_no_more_texels_than_wanted(exported, tmp_path, monkeypatch):
+    """Neither where they are dense, nor where they rise to hold what is recovered."""
+    exported.use(monkeypatch)
+    as_if_seen(monkeypatch)
+    words = {"max_texture": 64, "tell": lambda line: None}
+    for texels in (60.0, None):
+        out = tmp_path / f"{texels}"
+        told = exporting.export(exported.run, out, "gltf, mitsuba", texels=texels, **words)
+        assert told["formats"] == ["gltf", "mitsuba"]
+        assert {row["resolution"] for row in told["materials"]} == {64}
+        limited = [row for row in told["materials"] if row["wanted_resolution"] > 64]
+        assert sum("limited to 64 texels" in note for note in told["notes"]) == len(limited)
+        assert limited or texels is None
+        for image in trimesh.load(out / "scene.glb").geometry.values():
+            if image.visual.material.baseColorTexture:
+                assert image.visual.material.baseColorTexture.size == (64, 64)
+        sizes = {read_exr(file).shape[:2] for file in (out / "mitsuba" / "textures").glob("*.exr")}
+        assert max(size for size in sizes if size[1] == size[0]) <= (64, 64)
+
+
+@pytest.mark.parametrize(
+    "words", [{"formats": ["obj"]}, {"texels": -1.0}, {"formats": []}, {"max_texture": 1000}]
+)
 def test_wrong_words_are_told_before_anything_is_read(words, tmp_path):
     with pytest.raises(UserError) as error:
         exporting.export(tmp_path / "none", tmp_path / "out", **words)

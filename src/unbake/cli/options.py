@@ -24,7 +24,7 @@ Experiment = Annotated[experiments.Name, arg(metavar="WHAT", help_behavior_hint=
 Scale = Annotated[experiments.Scale, arg(metavar="SCALE")]
 Methods = Annotated[tuple[str, ...], arg(metavar="METHODS", help_behavior_hint="(required)")]
 Formats = Annotated[
-    tuple[exports.Format, ...],
+    tuple[str, ...],  # which `export` checks, as it takes commas
     arg(metavar="FORMATS", help_behavior_hint=f"(default: {' '.join(exports.DEFAULT_FORMATS)})"),
 ]
 #: Where a command writes to.

@@ -125,6 +125,7 @@ def export(
     out: Out,
     format: Formats = exports.DEFAULT_FORMATS,
     texels: Annotated[float | None, arg(metavar="TEXELS", help_behavior_hint="")] = None,
+    max_texture: Annotated[int, arg(metavar="TEXELS")] = 8192,
     metres_per_unit: Annotated[float, arg(metavar="METRES")] = 1.0,
     cameras: Flag = True,
     allow_outside: Flag = False,
@@ -145,6 +146,7 @@ def export(
         texels: Texels along a scene unit (default: one for each pixel of the training views on the
             surfaces, or more where what was recovered, or a known texture, is finer). A texture has
             from 64 to 8192 along an edge.
+        max_texture: Texels along an edge of a texture, at most: 64, 128, … or 8192.
         metres_per_unit: How long a unit of the scene is, in glTF and OpenUSD: 0.001 where it is a
             millimetre.
         cameras: Leave out the views of the data set, which are cameras in glTF and OpenUSD.
@@ -155,11 +157,12 @@ def export(
 
     console = Console(highlight=False)
     options: dict[str, Any] = {"allow_outside": allow_outside, "console": console, "tell": say}
-    options |= {"texels": texels, "metres_per_unit": metres_per_unit, "cameras": cameras}
-    run_export(run, out, format, **options)
+    options |= {"texels": texels, "max_texture": max_texture}
+    options |= {"metres_per_unit": metres_per_unit, "cameras": cameras}
+    written = run_export(run, out, format, **options)["formats"]
     files = {"gltf": "scene.glb", "textures": "textures", "mitsuba": "mitsuba/scene.xml"}
     files |= {"usd": "usd/scene.usdc"}
-    say(f"wrote {out}: {', '.join(files[name] for name in files if name in format)}, export.json")
+    say(f"wrote {out}: {', '.join(files[name] for name in files if name in written)}, export.json")
 
 
 def render(

@@ -21,7 +21,7 @@ from ..scene.parse import ParsedScene, is_reference, is_spectrum, reason
 from .constants import CUTOFF, FRACTIONS
 from .observed import Views, filled
 from .tessellate import Triangles
-from .unwrap import LARGEST, Atlas, Placed, joined, parameterized, surface_points
+from .unwrap import Atlas, Placed, joined, parameterized, surface_points
 
 #: Texels that are looked up at once; bounds the memory.
 CHUNK = 1 << 17
@@ -171,7 +171,7 @@ class Baker:
         _, uv = surface_points(atlas.placed, _TRIED)
         surface = self._surface(atlas)
         points = self._at(surface, uv, atlas.materials if known else ())
-        finest = min(_FINEST * n, LARGEST)
+        finest = min(_FINEST * n, atlas.most)
         while True:
             baked = self._compared(self._baked(surface, atlas, advance), uv, points, known=known)
             n = 2 * atlas.resolution
@@ -524,7 +524,7 @@ def bake_texture(
     if hit.any():
         scale = max(float(np.ptp(truth[hit])), 1e-3 * float(np.abs(truth[hit]).max()), 1e-6)
     n = baked.atlas.resolution
-    finest = min(_FINEST * n, LARGEST)
+    finest = min(_FINEST * n, baked.atlas.most)
     while True:
         found = _baked_texture(mesh, n, texture, colour)
         is_near = _share_near(found, uv, truth, hit, scale=scale) >= WANTED

@@ -17,6 +17,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +48,7 @@ from .mitsuba import write_scene
 from .observed import training_views
 from .parts import Part, Parts, parsed_principled, read_parts
 from .textures import COLOUR_SPACES, file_names, write_mask, write_textures
-from .unwrap import LARGEST, UNIQUE, Atlas, make_atlases
+from .unwrap import LARGEST, SMALLEST, UNIQUE, Atlas, make_atlases
 from .upright import Up
 from .usd import require_usd, write_usd
 
@@ -57,6 +58,8 @@ _ENVIRONMENT = Path("environment").with_suffix(".exr").name
 _UPRIGHT = Path("environment_upright").with_suffix(".exr").name
 #: Where nothing is known of the environment.
 _UNOBSERVED = Path("environment_unobserved").with_suffix(".png").name
+#: Texels along the edge of a texture.
+_SIZES = [1 << n for n in range(SMALLEST.bit_length() - 1, LARGEST.bit_length())]
 #: Texels along the diagonal of a scene that no camera sees.
 _BLIND = 1024
 #: Metres across a scene from which its unit is told to be another, maybe.
@@ -118,6 +121,7 @@ class _Wanted:
 
     formats: tuple[Format, ...]
     texels: float | None
+    most: int  #: texels along an edge
     metres: float
     cameras: bool
 
@@ -128,6 +132,7 @@ def export(
     formats: str | Collection[str] = DEFAULT_FORMATS,
     *,
     texels: float | None = None,
+    max_texture: int = LARGEST,
     metres_per_unit: float = 1.0,
     cameras: bool = True,
     allow_outside: bool = False,
@@ -139,10 +144,11 @@ def export(
     Args:
         run: folder of a fit.
         out: folder to write; it must be new or empty, and is filled only when all is complete.
-        formats: one of `FORMATS`, or several.
+        formats: one of `FORMATS`, or several, also with commas between them.
         texels: along a scene unit; None: one for each pixel of the training views on the surfaces,
             or more where the recovered fields or known textures hold finer detail, until 95 % of
             each surface differs from them by 2/255 at most, or is as solid where it is cut out.
+        max_texture: texels along an edge of a texture of a material, at most: a power of two.
         metres_per_unit: how long a unit of the scene is, as glTF and OpenUSD have it.
         cameras: write the views of the data set as cameras of glTF and OpenUSD.
         allow_outside: read files of the data set and its scene that lie outside of its folder.
@@ -157,8 +163,10 @@ def export(
             unknown, or the textures do not fit into memory or onto the disk.
     """
     run, out = Path(run), Path(out)
-    formats = [formats] if isinstance(formats, str) else formats
-    wanted = _require_sound(run, out, formats, _Wanted((), texels, metres_per_unit, cameras))
+    given = [formats] if isinstance(formats, str) else formats
+    names = [name.strip() for each in given for name in str(each).split(",") if name.strip()]
+    options = _Wanted((), texels, max_texture, metres_per_unit, cameras)
+    wanted = _require_sound(run, out, names, options)
     recovered = load_run(run, allow_outside=allow_outside)
     with filled_folder(out) as partial:
         manifest = _export(recovered, RunFolder(run), partial, wanted, console, tell)
@@ -177,10 +185,12 @@ def _require_sound(run: Path, out: Path, formats: Collection[str], wanted: _Want
         RunFolder(run).require_fitted()
     with collected(wrong):
         require_new_folder(out)
-    unknown = [str(name) for name in formats if name not in FORMATS]
+    unknown = [name for name in formats if name not in FORMATS]
     if unknown or not formats:
         what = f"no format named {', '.join(map(repr, unknown))}" if unknown else "no format given"
-        wrong.append(UserError(what, "--format", f"There are {', '.join(FORMATS)}"))
+        near = dict.fromkeys(x for name in unknown for x in get_close_matches(name, FORMATS, 1))
+        meant = f"Did you mean {' '.join(near)}? " if near else ""
+        wrong.append(UserError(what, "--format", f"{meant}There are {' '.join(FORMATS)}"))
     if "usd" in formats:
         with collected(wrong):
             require_usd()
@@ -188,6 +198,9 @@ def _require_sound(run: Path, out: Path, formats: Collection[str], wanted: _Want
     for option, number in numbers.items():
         if number is not None and not 1e-9 < number < 1e9:
             wrong.append(UserError(f"must be a number from 1e-9 to 1e9, not {number:g}", option))
+    if wanted.most not in _SIZES:
+        what = f"must be one of {', '.join(map(str, _SIZES))}, not {wanted.most}"
+        wrong.append(UserError(what, "--max-texture"))
     raise_together(wrong, most=None)
     return replace(wanted, formats=tuple(name for name in FORMATS if name in formats))
 
@@ -216,7 +229,7 @@ def _export(
     of_lamps = "mitsuba" in formats and bool(learned)
     placed = [p for p in found.parts if p.is_optimized or of_lamps]
     with _Bar(console) as bar:
-        atlases = make_atlases(found.scene, placed, density, bar.unwraps)
+        atlases = make_atlases(found.scene, placed, density, bar.unwraps, wanted.most)
         bar.total(sum(atlas.resolution**2 for atlas in atlases))
         baker, known = _baker(recovered, atlases, learned), set(formats) != {"mitsuba"}
         baked = []
@@ -515,7 +528,9 @@ def _notes(found: Parts, baked: Sequence[Baked], lights: Sequence[Light], remedy
     for one in filter(lambda each: each.atlas.is_optimized, baked):
         atlas = one.atlas
         if atlas.resolution < atlas.wanted:
-            notes.append(f"{atlas.name}: limited to {LARGEST} texels, {atlas.wanted} were wanted")
+            notes.append(
+                f"{atlas.name}: limited to {atlas.resolution} texels, {atlas.wanted} were wanted"
+            )
         if atlas.unique < UNIQUE:
             overlap = 100 * (1 - atlas.unique)
             notes.append(f"{atlas.name}: {overlap:.1f} % of its surface shares texels")

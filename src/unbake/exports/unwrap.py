@@ -54,6 +54,7 @@ class Atlas:
     unique: float  #: share of points whose texture coordinates lead back to them
     resolution: int  #: texels along an edge
     wanted: int  #: the resolution before it was limited
+    most: int = LARGEST  #: texels along an edge that it may have
 
     @property
     def is_optimized(self) -> bool:
@@ -75,6 +76,7 @@ def make_atlases(
     parts: Sequence[Part],
     texels: float,
     advance: Callable[[str], object] = lambda name: None,
+    most: int = LARGEST,
 ) -> list[Atlas]:
     """An atlas for each material that parts have, those of lamps last.
 
@@ -88,6 +90,7 @@ def make_atlases(
         parts: those with materials are placed, the others are passed over.
         texels: wanted along a scene unit.
         advance: called with the name of each material before it is unwrapped.
+        most: texels along an edge, a power of two.
 
     Raises:
         UserError: a material's parts cannot be unwrapped.
@@ -97,7 +100,7 @@ def make_atlases(
     atlases = []
     for name, group in zip(names, groups, strict=True):
         advance(name)
-        atlases.append(_atlas(name, group, texels))
+        atlases.append(_atlas(name, group, texels, most))
     return atlases
 
 
@@ -147,15 +150,15 @@ def _material_names(scene: ParsedScene, groups: list[list[Part]]) -> list[str]:
     return unique_names(names)
 
 
-def _atlas(name: str, parts: list[Part], texels: float) -> Atlas:
+def _atlas(name: str, parts: list[Part], texels: float, most: int) -> Atlas:
     materials = tuple(sorted({number for part in parts for number in part.materials}))
     own = _with_own(parts)
     if own is not None and (share := unique_share(own)) >= UNIQUE:
         filled = sum(_uv_areas(placed.triangles).sum() for placed in own)
-        wanted, resolution = _resolution(own, texels, float(filled))
-        return Atlas(name, materials, own, "own", share, resolution, wanted)
+        wanted, resolution = _resolution(own, texels, float(filled), most)
+        return Atlas(name, materials, own, "own", share, resolution, wanted, most)
     whole = [Placed(part, part.triangles, part.triangles.uv) for part in parts]
-    wanted, resolution = _resolution(whole, texels, _FILLED)
+    wanted, resolution = _resolution(whole, texels, _FILLED, most)
     found: list[Atlas] = []
     failures = []
     for method, unwrap in (("uvunwrap", _by_uvunwrap), ("xatlas", _by_xatlas)):
@@ -168,7 +171,9 @@ def _atlas(name: str, parts: list[Part], texels: float) -> Atlas:
             corners = [_askew(uv) for uv in corners]
         placed = [_split(part, uv) for part, uv in zip(parts, corners, strict=True)]
         share = unique_share(placed)
-        found.append(Atlas(name, materials, placed, method, share, size, wanted))
+        # Coordinates are shares of the page: fewer texels than it has are only less dense.
+        size = min(size, most)
+        found.append(Atlas(name, materials, placed, method, share, size, wanted, most))
         if share >= UNIQUE:
             break
     if not found:
@@ -178,12 +183,14 @@ def _atlas(name: str, parts: list[Part], texels: float) -> Atlas:
     return max(found, key=lambda atlas: atlas.unique)
 
 
-def _resolution(placed: list[Placed], texels: float, filled: float) -> tuple[int, int]:
+def _resolution(
+    placed: list[Placed], texels: float, filled: float, most: int = LARGEST
+) -> tuple[int, int]:
     """Texels along an edge: what is wanted, and within the limits; powers of two."""
     area = sum(float(each.triangles.areas().sum()) for each in placed)
     edge = texels * math.sqrt(area / max(filled, 1e-9))
     wanted = 1 << max(0, math.ceil(math.log2(max(edge, 1.0)) - 1e-9))
-    return wanted, min(max(wanted, SMALLEST), LARGEST)
+    return wanted, min(max(wanted, SMALLEST), most)
 
 
 # ------------------------------------------------------------------------- coordinates of the scene
