@@ -738,6 +738,30 @@ def test_lights_are_as_bright_where_units_are_not_metres(tmp_path):
     assert not exporting._of_strengths(lights[2:], 0.01, ["usd"])
 
 
+#: Lamps that are solids, and lamps with backs that are dark in Mitsuba.
+LAMPS = """<scene version="3.0.0">
+  <shape type="rectangle" id="panel"><emitter type="area"/></shape>
+  <shape type="disk" id="spot"><emitter type="area"/></shape>
+  <shape type="disk" id="off"><emitter type="area"/></shape>
+  <shape type="sphere" id="bulb"><emitter type="area"/></shape>
+  <shape type="cube" id="box"><emitter type="area"/></shape>
+  <shape type="rectangle" id="wall"/></scene>"""
+
+
+def test_lamps_with_backs_are_told(tmp_path):
+    (tmp_path / "scene.xml").write_text(LAMPS)
+    parts = read_parts(tmp_path / "scene.xml", tmp_path).parts
+    lights = [
+        SimpleNamespace(node=part.emitter, strength=(float(part.name != "off"),) * 3)
+        for part in parts
+        if part.emitter is not None
+    ]
+    (note,) = exporting._of_backs(parts, lights, ["gltf"])
+    assert note.endswith(": panel, spot") and "Backfacing" in note
+    assert exporting._of_backs(parts, lights, ["usd"]) == [note]
+    assert not exporting._of_backs(parts, lights, ["mitsuba"])
+
+
 @pytest.mark.parametrize(
     ("across", "metres", "told"),
     [
@@ -792,6 +816,7 @@ def test_the_environment_of_gltf_stands_upright(tmp_path):
         notes = exporting._environment_of_gltf(tmp_path, picture, up, formats)
         assert notes == [
             "glTF has no environment: for scene.glb it is environment_upright.exr",
+            "in Blender, its Environment Texture needs a Mapping, Rotation Z 90°",
             f"environment.exr has the axes of the scene{told}",
         ]
     write_exr(tmp_path / "environment.exr", picture)
@@ -807,8 +832,9 @@ def test_the_environment_of_gltf_stands_upright(tmp_path):
     assert np.linalg.norm(means[0]) > 0.9
     np.testing.assert_allclose(up.rotation("Y") @ means[0], means[1], atol=0.03)
     level = Up.of(cameras_of((0, 1, 0)))
-    (note,) = exporting._environment_of_gltf(tmp_path / "none", picture, level, ["gltf"])
-    assert note.endswith("for scene.glb it is environment.exr") and not (tmp_path / "none").exists()
+    note, turn = exporting._environment_of_gltf(tmp_path / "none", picture, level, ["gltf"])
+    assert note.endswith("for scene.glb it is environment.exr") and "Rotation Z 90°" in turn
+    assert not (tmp_path / "none").exists()
 
 
 def test_files_have_constants_and_what_is_left_out_is_told(tmp_path):

@@ -281,6 +281,7 @@ def _export(
             *_of_lamps(found, formats, learned),
             *_of_coordinates(baked, formats),
             *_of_strengths(lights, wanted.metres, formats),
+            *_of_backs(found.parts, lights, formats),
             *_of_axes([view.camera for view in dataset.train], formats),
             *_of_size(found.parts, wanted.metres, formats),
             *written.notes,
@@ -419,14 +420,15 @@ def _environment_of_gltf(
     if environment is None:
         return []
     what = "glTF has no environment: for scene.glb it is"
+    turn = "in Blender, its Environment Texture needs a Mapping, Rotation Z 90°"
     if not up.is_turned("Y"):
-        return [f"{what} {_ENVIRONMENT}"]
+        return [f"{what} {_ENVIRONMENT}", turn]
     write_exr(out / _UPRIGHT, turned_latlong(environment, up.rotation("Y")))
     kept = f"{_ENVIRONMENT} has the axes of the scene"
     others = " and ".join(name for name in ("mitsuba", "usd") if name in formats)
     if others:
         kept += f", as in {others}"
-    return [f"{what} {_UPRIGHT}", kept]
+    return [f"{what} {_UPRIGHT}", turn, kept]
 
 
 def _of_coordinates(baked: Sequence[Baked], formats: Sequence[Format]) -> list[str]:
@@ -456,6 +458,18 @@ def _of_strengths(lights: Sequence[Light], metres: float, formats: Sequence[Form
         what = f"in Blender, multiply the power of lights of scene.usdc by {metres**2:g}"
         notes.append(f"{what}, which it does not scale: {named(scaled)}")
     return notes
+
+
+def _of_backs(
+    parts: Sequence[Part], lights: Sequence[Light], formats: Sequence[Format]
+) -> list[str]:
+    """Which lamps have backs that shine in Cycles: it knows no lamps of one side."""
+    lit = {light.node for light in lights if light.strength is not None and any(light.strength)}
+    lamps = [part for part in parts if part.emitter in lit and not part.triangles.is_closed]
+    if not lamps or not {"gltf", "usd"} & set(formats):
+        return []
+    what = "in Blender, lamps shine on their backs unless Backfacing ends it"
+    return [f"{what}: {named([part.name for part in lamps])}"]
 
 
 def _of_axes(cameras: Sequence[Camera], formats: Sequence[Format]) -> list[str]:

@@ -8,10 +8,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ..scene.triangles import triangle_areas, unit
+from ..scene.triangles import doubled_normals, triangle_areas, unit
 
 #: Around a circle, and from pole to pole.
 _AROUND, _ALONG = 128, 64
+#: The share of its area by which a sheet faces one way, at least.
+_SHEET = 0.01
 #: Plugins that become triangles.
 TESSELLATED = ("sphere", "disk", "cylinder")
 
@@ -76,6 +78,12 @@ class Triangles:
     def areas(self) -> np.ndarray:
         """The areas of the triangles, (m,) float64."""
         return triangle_areas(self.positions, self.faces)
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether as much of it faces one way as the other: a solid, or a tube, but no sheet."""
+        total = np.linalg.norm(doubled_normals(self.positions, self.faces).sum(0))
+        return bool(total < _SHEET * 2 * self.areas().sum())
 
 
 def tessellated(plugin: str) -> Triangles:
