@@ -2151,6 +2151,36 @@ def test_many_charts_get_a_page_that_holds_them(mixed):
     assert atlas.method == "uvunwrap" and atlas.unique >= 0.999
 
 
+def test_charts_of_large_textures_are_further_apart(mixed):
+    """As far as mipmaps that halve a texture three times keep them apart, at little cost."""
+    found = read_parts(mixed, mixed.parent)
+    (block, *_) = (part for part in found.parts if part.name == "block")
+    (atlas,) = make_atlases(found.scene, [block], 4000.0)
+    assert atlas.resolution >= 1024 and atlas.method == "uvunwrap"
+    triangles = atlas.placed[0].triangles
+    chart = np.arange(len(triangles.positions))  # vertices are split where charts meet
+    for _ in chart:
+        for face in triangles.faces:
+            chart[face] = chart[face].min()
+    along = np.linspace(0, 1, 50)[:, None]
+    edges = {}
+    for face in triangles.faces:
+        for i, j in ((0, 1), (1, 2), (2, 0)):
+            a, b = triangles.uv[face[i]], triangles.uv[face[j]]
+            edges.setdefault(chart[face[0]], []).append(a + along * (b - a))
+    edges = [np.concatenate(each) for each in edges.values()]
+    assert len(edges) > 1
+    gaps = [
+        np.linalg.norm(one[:, None] - other[None], axis=-1).min()
+        for i, one in enumerate(edges)
+        for other in edges[:i]
+    ]
+    assert 0.9 / 128 < min(gaps) < 0.05
+    corners = triangles.uv[triangles.faces]
+    areas = np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1])) / 2
+    assert areas.sum() > 0.6
+
+
 def test_a_scene_of_many_parts_is_exported_whole(tmp_path):
     """Sixty meshes, half of them of one material, the others with one each."""
     rng = np.random.default_rng(0)

@@ -24,8 +24,11 @@ SMALLEST, LARGEST = 64, 8192
 POINTS, UNIQUE = 20_000, 0.999
 #: By how much the page of uvunwrap may grow until charts fit into it.
 _LARGER = 8
-#: Empty texels around charts.
+#: Empty texels around charts, at least.
 _PADDING = 2
+#: Of the edge of a texture: how far charts are apart where viewers average its texels far away, and
+#: how much of what charts fill must be left by that.
+_APART, _WORTH = 1 / 128, 0.9
 #: Of the extent of a material's parts: how near a point must come back.
 _NEAR = 1e-3
 #: Radians by which charts of bump maps are turned.
@@ -268,7 +271,12 @@ def _uv(triangles: Triangles) -> np.ndarray:
 
 
 def _uv_areas(triangles: Triangles) -> np.ndarray:
-    a, b, c = np.moveaxis(_uv(triangles)[triangles.faces].astype(np.float64), 1, 0)
+    return _areas_between(_uv(triangles)[triangles.faces])
+
+
+def _areas_between(corners: np.ndarray) -> np.ndarray:
+    """The areas of triangles with these corners (m, 3, 2), (m,) float64."""
+    a, b, c = np.moveaxis(corners.astype(np.float64), 1, 0)
     (x, y), (z, w) = (b - a).T, (c - a).T
     return np.abs(x * w - y * z) / 2
 
@@ -280,25 +288,40 @@ def _by_uvunwrap(meshes: list[Triangles], resolution: int) -> tuple[list[np.ndar
     """Texture coordinates of each corner, (m, 3, 2) a mesh, and the edge of a page that holds all.
 
     The page is doubled where charts do not fit: each has `_PADDING` around it, however small it is.
+    They are further apart in large textures where that costs little.
     """
     import uvunwrap  # needs Python 3.11
 
     given = [uvunwrap.Mesh(*_welded(mesh)) for mesh in meshes]
-    size, largest = resolution, min(_LARGER * resolution, LARGEST)
-    while True:
+
+    def packed(size: int, padding: int) -> list[np.ndarray] | str:
+        """Corners of each mesh, or why there are none."""
         try:
-            atlas = uvunwrap.generate(given, page_size=size, padding=_PADDING)
-            lacks = None if atlas.page_count == 1 else f"it needs {atlas.page_count} pages"
+            atlas = uvunwrap.generate(given, page_size=size, padding=padding)
         except uvunwrap.UnwrapError as error:
-            atlas, lacks = None, str(error)
-        if lacks is None or 2 * size > largest:
-            break
+            return str(error)
+        if atlas.page_count != 1:
+            return f"it needs {atlas.page_count} pages"
+        found = [np.array(mesh.corner_uvs, np.float32).reshape(-1, 3, 2) for mesh in atlas.meshes]
+        # A page that is less high than wide becomes a square: its texels are only denser.
+        return _checked(found, meshes)
+
+    size, largest = resolution, min(_LARGER * resolution, LARGEST)
+    wide = packed(size, max(_PADDING, int(_APART * size)))
+    if not isinstance(wide, str) and _filled_by(wide) >= _FILLED:
+        return wide, size
+    while isinstance(close := packed(size, _PADDING), str) and 2 * size <= largest:
         size *= 2
-    if atlas is None or lacks is not None:
-        raise RuntimeError(lacks)
-    corners = [np.array(mesh.corner_uvs, np.float32).reshape(-1, 3, 2) for mesh in atlas.meshes]
-    # A page that is less high than wide becomes a square: its texels are only denser.
-    return _checked(corners, meshes), size
+    if isinstance(close, str):
+        raise RuntimeError(close)
+    if not isinstance(wide, str) and _filled_by(wide) >= _WORTH * _filled_by(close):
+        return wide, resolution
+    return close, size
+
+
+def _filled_by(corners: list[np.ndarray]) -> float:
+    """The share of the square that triangles with these corners fill."""
+    return sum(float(_areas_between(each).sum()) for each in corners)
 
 
 def _by_xatlas(meshes: list[Triangles], resolution: int) -> tuple[list[np.ndarray], int]:
