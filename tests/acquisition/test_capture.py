@@ -55,6 +55,32 @@ def told():
     return []
 
 
+def test_the_axis_that_is_up_may_be_given(tmp_path, told, unbake):
+    """A ball on a ground with z up, and no sensor that tells so."""
+    file = tmp_path / "scene.xml"
+    file.write_text(
+        """<scene version="3.0.0"><emitter type="constant"/>
+        <shape type="sphere"><point name="center" x="0" y="0" z="1"/>
+          <bsdf type="principled"/></shape>
+        <shape type="rectangle"><transform name="to_world"><scale value="5"/></transform>
+          <bsdf type="twosided"><bsdf type="principled"/></bsdf></shape></scene>"""
+    )
+    lying = capture(file, tmp_path / "lying", TINY, tell=told.append)
+    assert lying.views[0].camera.to_world[1, 1] > 0.1
+    (line,) = [line for line in told if "--up" in line]
+    assert line.startswith("cameras are placed with +y up") and line.endswith("such as --up +z")
+    told.clear()
+    upright = capture(file, tmp_path / "upright", replace(TINY, up="+z"), tell=told.append)
+    assert upright.views[0].camera.to_world[2, 1] > 0.1
+    assert upright.views[0].camera.origin[2] > 0
+    assert not any("--up" in line for line in told)
+    with pytest.raises(UserError, match="--up: cannot be given with a built-in scene"):
+        capture("cube", tmp_path / "cube", replace(TINY, up="+z"), tell=told.append)
+    words = ("--cameras", front(tmp_path), "--up", "+z", "--out", tmp_path / "both")
+    outcome = unbake("capture", file, *words)
+    assert outcome.status == 2 and "--up" in outcome.err
+
+
 @pytest.fixture
 def objects(tmp_path, told):
     """An opaque and a glass ball before a sky, captured."""

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from unbake.acquisition.coverage import black_share, coverage, is_room, view_counts
-from unbake.acquisition.placement import place_object, place_room
+from unbake.acquisition.placement import place, place_object, place_room
 from unbake.dataset.camera import Camera
 from unbake.dataset.poses import check_cameras
 from unbake.errors import UserError
@@ -197,6 +197,31 @@ def test_up_is_y_without_a_sensor():
     assert free_space.up_axis(scene(ball={"type": "sphere"})).tolist() == [0, 1, 0]
 
 
+@pytest.mark.parametrize("up", [(0, 0, 1), (0, 0, -1), (1, 0, 0), (0, 1, 0)])
+def test_cameras_have_the_axis_up_that_is_asked_for(up, room, ball):
+    """Whatever the scene's own sensor says."""
+    tilted = scene(ball={"type": "sphere", "bsdf": MATTE}, sensor=sensor((0, 0, 4), (0, 0, 0)))
+    given = np.array(up, float)
+    for of in (tilted, ball):
+        placed = [look for _, look in place(of, 6, 1, up=given)]
+        assert all(look.up == up for look in placed)
+        assert all((np.array(look.origin) - look.target) @ given > 0 for look in placed)
+    assert all(look.up == up for _, look in place(room, 3, 1, up=given))
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_ground_that_speaks_for_another_axis_is_found(axis):
+    """Where no sensor tells which way is up."""
+    ball = {"type": "sphere", "center": np.eye(3)[axis].tolist(), "bsdf": MATTE}
+    normal = np.eye(3)[axis].tolist()
+    lies = mi.ScalarTransform4f().look_at([0, 0, 0], normal, np.roll(normal, 1).tolist())
+    ground = {"type": "rectangle", "to_world": lies.scale(5), "bsdf": MATTE}
+    assert free_space.ground_beside_y(scene(ball=ball, ground=ground)) == (axis != 1)
+    look = sensor((4, 4, 4), (0, 0, 0))
+    assert not free_space.ground_beside_y(scene(ball=ball, ground=ground, sensor=look))
+    assert not free_space.ground_beside_y(scene(ball=ball))
+
+
 def square(half, z=0):
     """A square whose normal is the z axis."""
     to_world = mi.ScalarTransform4f().translate([0, 0, z]).scale(half)
@@ -332,12 +357,12 @@ def test_small_shapes_get_more_points_when_asked_for():
     assert shares[1] == pytest.approx(areas[1] ** 0.5 / (areas**0.5).sum(), abs=0.03)
 
 
-@pytest.mark.parametrize("place", [place_room, place_object])
-def test_no_views_are_refused(room, place):
+@pytest.mark.parametrize("placed_as", [place_room, place_object])
+def test_no_views_are_refused(room, placed_as):
     with pytest.raises(UserError, match="0 training"):
-        place(room, 0, 1)
+        placed_as(room, 0, 1)
     with pytest.raises(UserError, match="-1 held-out"):
-        place(room, 1, -1)
+        placed_as(room, 1, -1)
 
 
 def test_scenes_that_no_camera_fits_into_are_refused():

@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..config.light import LightConfig
+from ..config.light import LightConfig, direction
 from ..dataset.camera import Camera
 from ..dataset.camera_files import named_by_split, read_cameras
 from ..dataset.data_folder import DataFolder
@@ -27,7 +27,7 @@ from ..fields.arrays import from_numpy
 from ..imaging.pictures import write_exr
 from ..io import is_locked, locked, removed_with_parents, require_file, require_utf8
 from ..quantities import QUANTITIES
-from ..scene import edit
+from ..scene import edit, free_space
 from ..scene.checked import checked_scene
 from ..scene.parse import ParsedScene, parse, write
 from ..signals import cleaned_up
@@ -225,6 +225,11 @@ def _choose_views(
     """
     if camera_file is None:
         posed = posed_cameras(name, scene, settings)
+        if settings.up == "auto" and name not in SCENES and free_space.ground_beside_y(scene):
+            tell(
+                "cameras are placed with +y up, as no sensor of the scene tells: all stands on a "
+                "ground with another axis up, which --up sets, such as --up +z"
+            )
     else:
         posed = _read_square(camera_file, settings.resolution, tell)
     if not any(split == "train" for split, _ in posed):
@@ -323,15 +328,19 @@ def posed_cameras(
         settings: how many, and the size of their images.
 
     Raises:
-        UserError: there is no place for cameras.
+        UserError: there is no place for cameras, or the scene's own need no axis that is up.
     """
     size = settings.resolution
     if name in SCENES:
+        if settings.up != "auto":
+            what = "cannot be given with a built-in scene, which has cameras of its own"
+            raise UserError(what, "--up", "Leave it out")
         return [
             (c["split"], Camera.look_at(c["origin"], c["target"], c["up"], c["fov"], size, size))
             for c in default_cameras(name, settings.views, settings.held_out)
         ]
-    placed = place(scene, settings.views, settings.held_out, seed=settings.seed)
+    up = None if settings.up == "auto" else np.array(direction(settings.up))
+    placed = place(scene, settings.views, settings.held_out, seed=settings.seed, up=up)
     return [(split, look.camera(size, size)) for split, look in placed]
 
 

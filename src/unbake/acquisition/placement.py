@@ -64,14 +64,22 @@ class _Candidates:
         )
 
 
-def place(scene: mi.Scene, views: int, held_out: int, *, seed: int = 0) -> list[tuple[str, LookAt]]:
+def place(
+    scene: mi.Scene, views: int, held_out: int, *, seed: int = 0, up: np.ndarray | None = None
+) -> list[tuple[str, LookAt]]:
     """Cameras of `place_room` or `place_object`, by `is_room`."""
     placed = place_room if is_room(scene) else place_object
-    return placed(scene, views, held_out, seed=seed)
+    return placed(scene, views, held_out, seed=seed, up=up)
 
 
 def place_room(
-    scene: mi.Scene, views: int, held_out: int, *, fov: float = 75.0, seed: int = 0
+    scene: mi.Scene,
+    views: int,
+    held_out: int,
+    *,
+    fov: float = 75.0,
+    seed: int = 0,
+    up: np.ndarray | None = None,
 ) -> list[tuple[str, LookAt]]:
     """Cameras inside a room that together cover its surfaces.
 
@@ -88,6 +96,7 @@ def place_room(
         held_out: number of held-out views.
         fov: horizontal (and vertical) field of view in degrees.
         seed: of all random choices; the same seed gives the same cameras.
+        up: signed coordinate axis (3,); None: `free_space.up_axis`.
 
     Returns:
         (split, placement) pairs, training views first.
@@ -97,7 +106,7 @@ def place_room(
     """
     _check_counts(views, held_out)
     diagonal = free_space.extent(scene)[2]
-    up = free_space.up_axis(scene)
+    up = free_space.up_axis(scene) if up is None else up
     positions = free_space.free_positions(scene, _POSITIONS, seed)
     if len(positions) == 0:
         raise UserError("no free space for a camera in the scene", remedy=_REMEDY)
@@ -119,7 +128,13 @@ def place_room(
 
 
 def place_object(
-    scene: mi.Scene, views: int, held_out: int, *, fov: float = 40.0, seed: int = 0
+    scene: mi.Scene,
+    views: int,
+    held_out: int,
+    *,
+    fov: float = 40.0,
+    seed: int = 0,
+    up: np.ndarray | None = None,
 ) -> list[tuple[str, LookAt]]:
     """Cameras on the upper hemisphere around an object, looking at its centre.
 
@@ -136,6 +151,7 @@ def place_object(
         held_out: number of held-out views.
         fov: horizontal field of view in degrees.
         seed: turns the cameras around the up axis; the same seed gives the same cameras.
+        up: signed coordinate axis (3,); None: `free_space.up_axis`.
 
     Returns:
         (split, placement) pairs, training views first.
@@ -146,7 +162,7 @@ def place_object(
     Paper: Sec. 6.
     """
     _check_counts(views, held_out)
-    up = free_space.up_axis(scene)
+    up = free_space.up_axis(scene) if up is None else up
     low, high = object_box(scene)
     centre, radius = sphere_around(low, high)
     count = views + held_out

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 from ..config.fit import DEEPEST
 from ..config.flag import Flag
+from ..config.light import Axis
 from ..errors import UserError, require_ranges
 
 #: Pixels of the training views, chosen at random, and samples of each, that measure how much light
@@ -46,6 +47,14 @@ class CaptureSettings:
     ] = 64
     rr_depth: int = 8  #: bounces before Russian roulette
     seed: Annotated[int, Flag("Seed of all random numbers")] = 0
+    #: Without a camera file, and not of built-in scenes.
+    up: Annotated[
+        Literal["auto", Axis],
+        Flag(
+            "World axis that is up, where cameras are placed automatically: auto is up by the "
+            "scene's own sensor, and +y without one"
+        ),
+    ] = "auto"
 
     def __post_init__(self) -> None:
         require_ranges(

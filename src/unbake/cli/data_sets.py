@@ -64,7 +64,8 @@ def capture(
         scene: A Mitsuba 3 XML file, or a built-in scene: demo, annex (two rooms, and training views
             of one), still, cornell, cube, furnace.
         out: Folder to write; it must not exist.
-        cameras: Camera file (or transforms.json) to use instead of --views and --held-out.
+        cameras: Camera file (or transforms.json) to use instead of --views, --held-out and
+            --up.
         envmap: Environment map (OpenEXR, HDR) to light the scene by, instead of its own light.
         lights: Mitsuba XML file with lights to use instead of the scene's own.
         allow_outside: Read files that the scene names outside of its folder.
@@ -73,7 +74,7 @@ def capture(
     """
     settings = with_options(CaptureSettings(), given(capture))
     if cameras is not None:
-        exclude_changed("cameras", CaptureSettings, given(capture), "views", "held-out")
+        exclude_changed("cameras", CaptureSettings, given(capture), "views", "held-out", "up")
     other = any_light(envmap, lights, given(light))
     backend.activate()
     from ..acquisition.capture import capture as run_capture

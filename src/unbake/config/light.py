@@ -15,6 +15,13 @@ from .flag import Flag
 Axis = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
 
 
+def direction(axis: Axis) -> tuple[float, float, float]:
+    """The unit vector (3,) of a world axis."""
+    sign = -1.0 if axis[0] == "-" else 1.0
+    x, y, z = (sign if axis[1] == name else 0.0 for name in "xyz")
+    return x, y, z
+
+
 @dataclass(frozen=True)
 class LightConfig:
     """Light that takes the place of all the light of a scene.
@@ -73,9 +80,7 @@ class LightConfig:
     @property
     def up(self) -> tuple[float, float, float]:
         """The world axis of the map's first row, (3,)."""
-        sign = -1.0 if self.envmap_up[0] == "-" else 1.0
-        x, y, z = (sign if self.envmap_up[1] == name else 0.0 for name in "xyz")
-        return x, y, z
+        return direction(self.envmap_up)
 
     @property
     def turn(self) -> float:

@@ -144,6 +144,11 @@ def _level_axis(scene: mi.Scene) -> int:
     return int(np.argmax(np.abs(up_axis(scene))))
 
 
+def ground_beside_y(scene: mi.Scene) -> bool:
+    """Whether no sensor tells up, and all stands on a ground that is not level where y is up."""
+    return not _with_rays(scene) and _level_axis(scene) != 1
+
+
 def _has_ground(scene: mi.Scene, axis: int, sign: float) -> bool:
     """Whether all that is not a lamp stands on a flat shape, up being an axis of this sign."""
     corners = _corners(shape for shape in scene.shapes() if not shape.is_emitter())
