@@ -74,8 +74,8 @@ def test_two_methods_side_by_side(compare, tmp_path):
         assert row["rate_factors"] == {k: config.rate_factors[k] for k in row["rate_factors"]}
         assert row["estimator"] == "all-pairs" and row["representation"] == "neural"
         assert row["radiance"] == {"ours": "neural", "direct": None}[name]
-        own = ("final_learning_rate", "warm_up", "beta2", "least_slope")
-        assert {key: row[key] for key in own} == {key: getattr(config, key) for key in own}
+        settings = ("final_learning_rate", "warm_up", "beta2", "least_slope")
+        assert [row[key] for key in settings] == [getattr(config, key) for key in settings]
         searches = newest_progress(RunFolder(out / name)).searched
         assert row["searches"] == searches
         metrics = json.loads((out / name / "evaluation" / "metrics.json").read_text())
@@ -95,10 +95,8 @@ def test_two_methods_side_by_side(compare, tmp_path):
     assert raced == {(run, name) for run in ("ours", "direct") for name in ("albedo", "roughness")}
     assert found["format"] == 2 and "1 and 2 dB" in found["definitions"]["time_to_quality"]
     assert found["methods"]["direct"]["beta2"] > found["methods"]["ours"]["beta2"]
-    assert found["definitions"].keys() >= {*own, "searches"}
-    assert (
-        "ms a step" in " ".join(outcome.out.split()) and "Seconds to roughness PSNR" in outcome.out
-    )
+    assert found["definitions"].keys() >= {*settings, "searches"}
+    assert "ms a" in outcome.out and "Seconds to roughness PSNR" in outcome.out
     page = (out / "report.html").read_text()
     assert "Time to quality" in page and "Held-out albedo PSNR" in page
     assert "all pairs" in page and "Validation during training" not in page
