@@ -51,6 +51,16 @@ def vectors(columns):
     return mi.Vector3f(*[mi.Float(np.asarray(c, np.float32)) for c in columns])
 
 
+def test_coarse_levels_count_as_often_as_their_gain():
+    once, fourfold = EnvironmentMap(16, scale=1.5), EnvironmentMap(16, scale=1.5, coarse_gain=4.0)
+    values = randomised(once, 3, 0.7)
+    once.prepare()
+    fourfold.assign({k: v / (4 if k in ("level.4", "level.8") else 1) for k, v in values.items()})
+    fourfold.prepare()
+    assert set(values) == {"level.4", "level.8", "level.16"}
+    np.testing.assert_allclose(np.array(fourfold.texels), np.array(once.texels), rtol=1e-5)
+
+
 def lit_scene(emitter):
     """A ball on the ground, half metal, a small lamp, and the environment."""
     transform = mi.ScalarTransform4f()

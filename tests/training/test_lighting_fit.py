@@ -35,7 +35,7 @@ from unbake.training.told_scale import weigh_convention
 from unbake.transport.prb import materials_along_paths, path_radiance, path_replay
 from unbake.transport.wavefront import PathLimits, path_light, plan_widths
 
-FAST = LightingConfig(resolution=16, learning_rate=0.1)
+FAST = LightingConfig(resolution=16, learning_rate=0.1, coarse_gain=1.0)
 
 
 @pytest.fixture(scope="module")

@@ -130,6 +130,9 @@ class LightingConfig:
     #: around the horizon, as an image of 2n x n pixels has.
     resolution: int = 64
     learning_rate: float = 0.02  #: Adam, log radiance
+    #: How many times as fast the levels of 4 and 8 texels along an edge learn, where materials are
+    #: unknown as well (ours).
+    coarse_gain: float = 4.0
     #: Radiance of the map at the start, W·sr⁻¹·m⁻²; 0: the level of the photographs (ours).
     initial_radiance: float = 0.0
     mean_albedo: float = 0.5  #: the convention, mean over channels, less if one is above 0.8 (ours)
@@ -147,6 +150,7 @@ class LightingConfig:
     def __post_init__(self) -> None:
         # The map is up to e^20 times as bright as it starts: `fields/envmap.py`.
         ranges = {"initial_radiance": (0, 1e20), "learning_rate": RATES}
+        ranges |= {"coarse_gain": (POSITIVE, 1e3)}
         require_ranges(self, ranges | dict.fromkeys(("anchor", "final_anchor"), (0, 1e6)))
         known = self.resolution in (8, 16, 32, 64, 128, 256, 512)
         require(known, "resolution", "8, 16, 32, 64, 128, 256 or 512", self.resolution)

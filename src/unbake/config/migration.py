@@ -39,7 +39,7 @@ _NEURAL_ALBEDO = "materials.albedo.neural"
 #: it began. By the table that they are in, where there is one.
 _BEFORE_8: dict[str, dict[str, Any]] = {
     "": {"lamp_pictures": "ignored"},
-    "lighting": {"mean_colour": "grey", "final_anchor": 1.0},
+    "lighting": {"mean_colour": "grey", "final_anchor": 1.0, "coarse_gain": 1.0},
 }
 _BEFORE_7: dict[str, dict[str, Any]] = {_NEURAL_ROUGHNESS: {"pieces.places": 0}}
 _BEFORE_6: dict[str, dict[str, Any]] = {_NEURAL_ROUGHNESS: {"pieces.own_colours": 0}}

@@ -40,7 +40,9 @@ def _paper() -> FitConfig:
         loss_reference="photograph",
         loss_epsilon=0.01,
         least_slope=0.0,
-        lighting=LightingConfig(resolution=128, learning_rate=5e-4, initial_radiance=1.0),
+        lighting=LightingConfig(
+            resolution=128, learning_rate=5e-4, initial_radiance=1.0, coarse_gain=1.0
+        ),
         regularization=RegularizationConfig(albedo_smoothness=0.0),
         roughness_search=RoughnessSearchConfig(
             times=0, pixels_as_one=0.0, pixels_at_most=0, rate_before=1.0

@@ -17,6 +17,7 @@ import numpy as np
 from .domain import bounded
 
 COARSEST = 4  #: texels along an edge of the first level
+COARSE = 8  #: texels along an edge of the last level that is coarse
 UNIFORM_SHARE = 0.05  #: of the directions, drawn from the whole sphere, so that no density is zero
 BOUND = 20.0  #: of the log of radiance over scale, so that nothing overflows single precision
 FAR = 1e10  #: distance of the environment, in world units; it only has to lie behind all shapes
@@ -25,21 +26,23 @@ FAR = 1e10  #: distance of the environment, in world units; it only has to lie b
 class EnvironmentMap:
     """Learned radiance of an environment, positive by construction.
 
-    L = scale · exp(Σ levels), bilinear in the square. The levels have 4², 8², … resolution² texels,
-    each interpolated to the next: coarse ones let low frequencies converge fast.
+    L = scale · exp(Σ gain · level), bilinear in the square. The levels have 4², 8², … resolution²
+    texels, each interpolated to the next: coarse ones let low frequencies converge fast.
 
     After `assign`, and after a frozen function that assigns, call `prepare`.
 
     Args:
         resolution: texels along an edge of the square, a power of two, 4 or more.
         scale: radiance at the start, linear RGB, W·sr⁻¹·m⁻².
+        coarse_gain: gain of coarse levels, which Adam moves so many times as fast; 1 of all others.
 
     Paper: Sec. 5.1, Fig. 8.
     """
 
-    def __init__(self, resolution: int, *, scale: float) -> None:
+    def __init__(self, resolution: int, *, scale: float, coarse_gain: float = 1.0) -> None:
         self.resolution = resolution
         self.scale = scale
+        self.coarse_gain = coarse_gain
         sizes = [COARSEST]
         while sizes[-1] < resolution:
             sizes.append(2 * sizes[-1])
@@ -67,7 +70,8 @@ class EnvironmentMap:
         latent = mi.Color3f(0)
         for n, level in self._levels.items():
             coarse = _upsampled(latent, n // 2) if n > COARSEST else 0
-            latent = dr.unravel(mi.Color3f, level) + coarse
+            gain = self.coarse_gain if n <= COARSE else 1.0
+            latent = gain * dr.unravel(mi.Color3f, level) + coarse
         # Clipped texels keep a gradient, which brings them back.
         latent += dr.detach(dr.clip(latent, -BOUND, BOUND) - latent)
         values = self.scale * dr.exp(latent)

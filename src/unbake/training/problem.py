@@ -179,7 +179,8 @@ def make_problem(
         materials = _unknown_materials(parsed, config, int(seeds[0]))
     if config.learns_environment:
         start = config.lighting.initial_radiance or scale
-        environment = EnvironmentMap(config.lighting.resolution, scale=start)
+        gain = config.lighting.coarse_gain if config.learns_materials else 1.0
+        environment = EnvironmentMap(config.lighting.resolution, scale=start, coarse_gain=gain)
         edit.set_environment(parsed, environment_emitter(environment))
     if config.learns_emission:
         places = emitters.places(parsed)
