@@ -81,6 +81,26 @@ def test_the_axis_that_is_up_may_be_given(tmp_path, told, unbake):
     assert outcome.status == 2 and "--up" in outcome.err
 
 
+def test_photographs_of_an_object_show_the_sky_if_asked_to(tmp_path, told):
+    file = tmp_path / "scene.xml"
+    file.write_text(
+        """<scene version="3.0.0">
+        <emitter type="constant"><rgb name="radiance" value="0.2, 0.3, 0.5"/></emitter>
+        <shape type="sphere"><bsdf type="principled"/></shape></scene>"""
+    )
+    seen = {}
+    for background in ("auto", "visible", "hidden"):
+        settings = replace(TINY, background=background, resolution=16)
+        data = capture(file, tmp_path / background, settings, tell=told.append)
+        picture = read_exr(data.views[0].image)
+        corner = picture[0, 0]
+        assert data.background == ("visible" if background == "visible" else "hidden")
+        assert corner[3] == (1 if background == "visible" else 0)
+        seen[background] = corner[:3]
+    assert not seen["auto"].any() and not seen["hidden"].any()
+    np.testing.assert_allclose(seen["visible"], [0.2, 0.3, 0.5], rtol=1e-3)
+
+
 @pytest.fixture
 def objects(tmp_path, told):
     """An opaque and a glass ball before a sky, captured."""

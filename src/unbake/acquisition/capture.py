@@ -153,7 +153,7 @@ def _capture(
     file = write_scene(name, written) if name in SCENES else Path(name)
     source = _Source(file, light, allow_outside)
     path, apart = _copy_scene(source, data.scene, tell)
-    posed, seen, room = _choose_views(name, apart, settings, camera_file, tell)
+    posed, seen, visible = _choose_views(name, apart, settings, camera_file, tell)
     tell_tilt(light, [c for split, c in posed if split == "train"], tell)
     del apart  # while two scenes live, kernels have the shapes of both
     scene = source.instance()
@@ -164,17 +164,17 @@ def _capture(
     if spp != settings.spp:
         tell(f"{spp} samples per pixel instead of {settings.spp}: they fill a grid")
     sampler = mi.load_dict({"type": "multijitter", "sample_count": spp})
-    rgb, alpha, noise = photographs(scene, rays, settings, sampler, room, tell)
+    rgb, alpha, noise = photographs(scene, rays, settings, sampler, visible, tell)
     if not rgb.any():
         what = "all photographs are black: no light reaches what the cameras see"
         remedy = "Check where its lights are, and where they shine"
-        if not room:
-            remedy += "; photographs of objects do not show lamps themselves"
+        if not visible:
+            remedy += "; photographs with a hidden background do not show lamps themselves"
         raise UserError(what, source.file, remedy)
     _tell_noise(noise, spp, tell)
     truth, mask = _truth(path, scene, rays)
     write_true_lighting(path, data.path)
-    shares = light_of_views(scene, [c for split, c in posed if split == "train"], settings, room)
+    shares = light_of_views(scene, [c for split, c in posed if split == "train"], settings, visible)
     views, first = [], 0
     for view_name, split, camera in named_by_split(posed):
         shape = (camera.height, camera.width)
@@ -194,7 +194,7 @@ def _capture(
     return Dataset(
         folder=data.path,
         scene=path,
-        background="visible" if room else "hidden",
+        background="visible" if visible else "hidden",
         views=tuple(views),
         render={
             "integrator": path_integrator(scene),
@@ -221,7 +221,7 @@ def _choose_views(
     """The cameras and their splits, and what is told of them.
 
     Returns:
-        Cameras; the share of the surface that training views see; whether they stand in a room.
+        Cameras; the share of the surface that training views see; whether they show emitters.
     """
     if camera_file is None:
         posed = posed_cameras(name, scene, settings)
@@ -246,8 +246,11 @@ def _choose_views(
     if black > BLACK:
         tell(f"warning: {100 * black:.0f} % {BLACK_BACKS}. {TURN_THEM}")
     # Cameras of a file may stand elsewhere than the scene's own sensors.
-    room = is_room(scene, () if camera_file is None else [c for _, c in posed])
-    return posed, seen, room
+    if settings.background == "auto":
+        visible = is_room(scene, () if camera_file is None else [c for _, c in posed])
+    else:
+        visible = settings.background == "visible"
+    return posed, seen, visible
 
 
 def samples_of_grid(count: int) -> int:
@@ -349,7 +352,7 @@ def photographs(
     rays: CameraRays,
     settings: CaptureSettings,
     sampler: mi.Sampler,
-    room: bool,
+    visible: bool,
     tell: Callable[[str], None],
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Path trace all pixels of all views with Mitsuba.
@@ -359,7 +362,7 @@ def photographs(
         rays: of the views.
         settings: lengths of paths, and the seed.
         sampler: with the number of samples a pixel.
-        room: whether emitters are seen.
+        visible: whether emitters are seen.
         tell: called with lines of progress.
 
     Returns:
@@ -375,10 +378,10 @@ def photographs(
             "type": path_integrator(scene),
             "max_depth": settings.max_depth,
             "rr_depth": settings.rr_depth,
-            "hide_emitters": not room,
+            "hide_emitters": not visible,
         }
     )
-    hidden_lamps = not room and has_area_emitters(scene)
+    hidden_lamps = not visible and has_area_emitters(scene)
     spp = sampler.sample_count()
     sampler.set_samples_per_wavefront(spp)
     rgb = np.zeros((rays.pixels, 3), np.float32)
@@ -428,7 +431,7 @@ def _tell_noise(noise: float, spp: int, tell: Callable[[str], None]) -> None:
 
 
 def light_of_views(
-    scene: mi.Scene, cameras: list[Camera], settings: CaptureSettings, room: bool
+    scene: mi.Scene, cameras: list[Camera], settings: CaptureSettings, visible: bool
 ) -> tuple[float, ...]:
     """The shares of the light that paths of depth 1, 2, … carry to views; see `light_by_depth`.
 
@@ -436,7 +439,7 @@ def light_of_views(
         scene: with its true materials.
         cameras: of the views.
         settings: of the paths that carry all light.
-        room: whether emitters are seen.
+        visible: whether emitters are seen.
 
     Returns:
         Shares to four digits, up to the depth that carries all; none where there is no light.
@@ -454,7 +457,7 @@ def light_of_views(
         settings.seed + 1,
         max_depth=settings.max_depth,
         rr_depth=settings.rr_depth,
-        hide_emitters=not room,
+        hide_emitters=not visible,
         groups=LIGHT_SAMPLES,
     ).round(4)
     return tuple(shares[: np.searchsorted(shares, 1.0) + 1].tolist()) if shares[-1] > 0 else ()

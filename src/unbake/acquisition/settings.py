@@ -55,6 +55,13 @@ class CaptureSettings:
             "scene's own sensor, and +y without one"
         ),
     ] = "auto"
+    background: Annotated[
+        Literal["auto", "visible", "hidden"],
+        Flag(
+            "Whether photographs show the environment and lamps: auto hides them around objects, "
+            "and shows them in rooms"
+        ),
+    ] = "auto"
 
     def __post_init__(self) -> None:
         require_ranges(
