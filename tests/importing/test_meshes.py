@@ -364,10 +364,11 @@ def test_what_is_told_of_the_mesh_cures_as_much_as_other_poses(mistake, captured
         assert np.allclose(mistake.scale * here, there, rtol=1e-4, atol=1e-4 * mistake.scale)
 
 
-def exported(points, file, direction, generator=None):
+def exported(points, file, direction, generator=None, metres=1.0):
     """Write triangles as an export does, of a scene with this direction up.
 
     Args:
+        metres: of a unit of the scene.
         generator: that the file tells; None: its own.
     """
     document = Document()
@@ -375,7 +376,7 @@ def exported(points, file, direction, generator=None):
     mesh = document.add("meshes", {"primitives": [{"attributes": {"POSITION": corners}}]})
     node = document.add("nodes", {"name": "thing", "mesh": mesh})
     document.json["scenes"][0]["nodes"].append(node)
-    document.turn(Up(np.array(direction, float), "", 0.0))
+    document.turn(Up(np.array(direction, float), "", 0.0), metres)
     if generator is not None:
         document.json["asset"]["generator"] = generator
     document.write(file)
@@ -393,6 +394,16 @@ def test_what_was_exported_upright_is_turned_back(up, tmp_path):
     exported(points, tmp_path / "other.glb", up, "another program")
     (other,) = parts_of(tmp_path / "other.glb")
     assert np.abs(other.positions - upright.positions).max() < 1e-6
+
+
+@pytest.mark.parametrize("up", [(0, 0, 1), (0, 1, 0)])
+def test_what_was_exported_in_metres_has_its_units_again(up, tmp_path):
+    points = np.random.default_rng(0).normal(size=(9, 3))
+    exported(points, tmp_path / "own.glb", up, metres=0.001)
+    (part,) = parts_of(tmp_path / "own.glb")
+    np.testing.assert_allclose(part.positions, points, rtol=1e-4, atol=1e-6)
+    (small,) = read_parts([tmp_path / "own.glb"], Faults(), upright=True)
+    assert np.ptp(small.positions) == pytest.approx(0.001 * np.ptp(points), rel=1e-4)
 
 
 def test_what_an_export_did_not_turn_stays(tmp_path):
@@ -414,7 +425,7 @@ def test_an_import_turns_back_what_was_exported(captured, tmp_path):
         (part,) = parts_of(*(out / "scene" / "meshes").iterdir())
         found[name] = np.ptp(part.positions, axis=0)
     assert np.allclose(found["own"], (1, 2, 3)) and np.allclose(found["other"], (1, 3, 2))
-    assert sum("it is turned back" in line for line in lines["own"]) == 1
+    assert sum("of an export of unbake" in line for line in lines["own"]) == 1
     assert sum("with --mesh-y-up" in line for line in lines["other"]) == 1
     assert not any("--mesh-y-up" in line for line in lines["own"])
 
@@ -443,7 +454,8 @@ def test_ways_up_that_may_differ_are_told(captured, tmp_path):
     def told(file, cameras=tall, *, upright=False, moved=False):
         return gltf.told_up([file], cameras, upright=upright, moved=moved)
 
-    assert told(own) == [f"mesh: unbake exported it upright, and it is turned back: {own}"]
+    back = "mesh: of an export of unbake, taken back to the axes and units there"
+    assert told(own) == [f"{back}: {own}"]
     assert told(own, upright=True) == told(plain) == told(tmp_path / "mesh.ply") == []
     (line,) = told(other)
     assert line.startswith("GLB files have y up") and line.endswith("with --mesh-y-up")

@@ -45,9 +45,10 @@ def plain_nodes(file: Path) -> list[str]:
 
 
 def turned_back(file: Path) -> np.ndarray | None:
-    """What takes a mesh that `unbake export` turned upright to the axes of its scene, (4, 4).
+    """What takes a mesh that `unbake export` turned or scaled to the axes and units of its scene.
 
-    None: the file is of another kind, or nothing was turned.
+    Returns:
+        (4, 4); None: the file is of another kind, or nothing was turned or scaled.
     """
     if not _is_own(file):
         return None
@@ -55,17 +56,20 @@ def turned_back(file: Path) -> np.ndarray | None:
         top = _document(file)
         (root,) = top["scenes"][0]["nodes"]
         node = top["nodes"][root]
-        x, y, z, w = (float(value) for value in node["rotation"])
-    except (OSError, ValueError, TypeError, LookupError, RecursionError):
+        x, y, z, w = (float(value) for value in node.get("rotation", (0, 0, 0, 1)))
+        scale, *_ = (float(value) for value in node.get("scale", (1, 1, 1)))
+    except (OSError, ValueError, TypeError, AttributeError, LookupError, RecursionError):
         return None
     length = float(np.linalg.norm((x, y, z, w)))
-    if node.get("name") != _UPRIGHT or not (np.isfinite(length) and length > 0):
+    sound = np.isfinite(length) and length > 0 and np.isfinite(scale) and scale > 0
+    if node.get("name") != _UPRIGHT or not sound:
         return None
     x, y, z, w = (-x / length, -y / length, -z / length, w / length)
     across = np.array([(0, -z, y), (z, 0, -x), (-y, x, 0)])
     found = np.eye(4)
     found[:3, :3] += 2 * w * across + 2 * across @ across
-    return found
+    found[:3, :3] /= scale
+    return None if np.array_equal(found, np.eye(4)) else found
 
 
 def told_up(
@@ -83,7 +87,9 @@ def told_up(
         return []
     own = [str(file) for file in files if turned_back(file) is not None]
     notes = (
-        [f"mesh: unbake exported it upright, and it is turned back: {named(own)}"] if own else []
+        [f"mesh: of an export of unbake, taken back to the axes and units there: {named(own)}"]
+        if own
+        else []
     )
     others = any(file.suffix.lower() in GLTF and not _is_own(file) for file in files)
     if others and not moved and axis_of(up_of(cameras)) == "+z":
