@@ -30,7 +30,7 @@ from unbake.config import (
     to_toml,
 )
 from unbake.config.light import LightConfig
-from unbake.config.migration import FORMAT, as_before
+from unbake.config.migration import FORMAT, as_before, migrated
 from unbake.errors import UserError
 from unbake.evaluation.settings import EvaluationSettings, RenderSettings
 from unbake.fields.settings import LEAK, PieceConfig
@@ -388,6 +388,14 @@ def test_fields_of_earlier_runs_do_not_leak():
     assert found == [LEAK, 0]
     assert as_before("radiance.neural") == as_before("radiance.triplane") == {"leak": 0}
     assert as_before("radiance.grid") == as_before("radiance") == {}
+
+
+def test_the_convention_of_earlier_runs_keeps_its_weight():
+    for anchor in (0.01, 10.0):
+        old = migrated({"format": 7, "lighting": {"anchor": anchor}})["lighting"]
+        assert old["final_anchor"] == anchor and old["coarse_gain"] == 1
+    new = migrated({"format": FORMAT, "lighting": {"anchor": 10.0}})
+    assert new == {"lighting": {"anchor": 10.0}}
 
 
 def test_earlier_runs_go_by_the_background_where_the_scale_is_open():

@@ -68,7 +68,7 @@ def test_the_axis_that_is_up_may_be_given(tmp_path, told, unbake):
     lying = capture(file, tmp_path / "lying", TINY, tell=told.append)
     assert lying.views[0].camera.to_world[1, 1] > 0.1
     (line,) = [line for line in told if "--up" in line]
-    assert line.startswith("cameras are placed with +y up") and line.endswith("such as --up +z")
+    assert line.startswith("cameras are placed with +y up") and line.endswith("--up +z sets")
     told.clear()
     upright = capture(file, tmp_path / "upright", replace(TINY, up="+z"), tell=told.append)
     assert upright.views[0].camera.to_world[2, 1] > 0.1
@@ -76,6 +76,8 @@ def test_the_axis_that_is_up_may_be_given(tmp_path, told, unbake):
     assert not any("--up" in line for line in told)
     with pytest.raises(UserError, match="--up: cannot be given with a built-in scene"):
         capture("cube", tmp_path / "cube", replace(TINY, up="+z"), tell=told.append)
+    with pytest.raises(UserError, match="up: cannot be given with a camera file"):
+        capture(file, tmp_path / "both", replace(TINY, up="+z"), cameras=front(tmp_path))
     words = ("--cameras", front(tmp_path), "--up", "+z", "--out", tmp_path / "both")
     outcome = unbake("capture", file, *words)
     assert outcome.status == 2 and "--up" in outcome.err

@@ -216,10 +216,13 @@ def test_a_ground_that_speaks_for_another_axis_is_found(axis):
     normal = np.eye(3)[axis].tolist()
     lies = mi.ScalarTransform4f().look_at([0, 0, 0], normal, np.roll(normal, 1).tolist())
     ground = {"type": "rectangle", "to_world": lies.scale(5), "bsdf": MATTE}
-    assert free_space.ground_beside_y(scene(ball=ball, ground=ground)) == (axis != 1)
+    found = free_space.up_of_ground(scene(ball=ball, ground=ground))
+    assert found == (None if axis == 1 else f"+{'xyz'[axis]}")
+    under = {**ball, "center": (-np.eye(3)[axis]).tolist()}
+    assert free_space.up_of_ground(scene(ball=under, ground=ground)) == f"-{'xyz'[axis]}"
     look = sensor((4, 4, 4), (0, 0, 0))
-    assert not free_space.ground_beside_y(scene(ball=ball, ground=ground, sensor=look))
-    assert not free_space.ground_beside_y(scene(ball=ball))
+    assert free_space.up_of_ground(scene(ball=ball, ground=ground, sensor=look)) is None
+    assert free_space.up_of_ground(scene(ball=ball)) is None
 
 
 def square(half, z=0):

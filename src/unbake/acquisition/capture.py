@@ -225,11 +225,14 @@ def _choose_views(
     """
     if camera_file is None:
         posed = posed_cameras(name, scene, settings)
-        if settings.up == "auto" and name not in SCENES and free_space.ground_beside_y(scene):
+        asked = settings.up == "auto" and name not in SCENES
+        if asked and (axis := free_space.up_of_ground(scene)):
             tell(
                 "cameras are placed with +y up, as no sensor of the scene tells: all stands on a "
-                "ground with another axis up, which --up sets, such as --up +z"
+                f"ground with {axis} up, which --up {axis} sets"
             )
+    elif settings.up != "auto":
+        raise UserError("cannot be given with a camera file", "up", "Leave one of both out")
     else:
         posed = _read_square(camera_file, settings.resolution, tell)
     if not any(split == "train" for split, _ in posed):

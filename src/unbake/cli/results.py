@@ -145,7 +145,7 @@ def export(
             (OpenUSD; it needs pip install 'unbake[usd]').
         texels: Texels along a scene unit (default: one for each pixel of the training views on the
             surfaces, or more where what was recovered, or a known texture, is finer). A texture has
-            from 64 to 8192 along an edge.
+            from 64 to --max-texture along an edge.
         max_texture: Texels along an edge of a texture, at most: 64, 128, … or 8192.
         metres_per_unit: How long a unit of the scene is, in glTF and OpenUSD: 0.001 where it is a
             millimetre.

@@ -139,8 +139,9 @@ class LightingConfig:
     #: Its colour: of the photographs, as if light were white, or grey, as if surfaces were (ours).
     mean_colour: MeanColour = "photographs"
     anchor: float = 1.0  #: weight of the squared deviation from it, in the first tenth of a fit
-    #: The same in its second half. In between it falls: light between surfaces tells of the factor
-    #: as well, and is heard once materials are near where they belong (ours).
+    #: The same in its second half, and never more than the first. In between it falls: light
+    #: between surfaces tells of the factor as well, and is heard once materials are near where they
+    #: belong (ours).
     final_anchor: float = 0.003
     #: What tells the factor instead. pixels: those to train on that show unknown light, directly or
     #: in mirrors and glass, and are not clipped; background: any that is visible, and no mirror

@@ -114,6 +114,9 @@ def migrated(table: dict[str, Any]) -> dict[str, Any]:
         if version is None or version < came_with
         for item in tables.items()
     ]
+    if written and not _has(found, "lighting.final_anchor") and _has(found, "lighting.anchor"):
+        # The weight was the same throughout.
+        _put(found, "lighting.final_anchor", found["lighting"]["anchor"], "lighting.final_anchor")
     for outer, settings in every if written else ():
         if outer and not _has(found, outer):
             continue

@@ -36,7 +36,8 @@ _UNCOVERED = 0.03
 #: not count: from below, a ground has much the same edges, and hides all that stands on it.
 _ALIKE, _HARDLY = 0.15, 0.1
 #: The share of the surface below which poses as they are may be such, and points that tell it.
-_UNSEEN, _POINTS = 0.02, 512
+#: Close views of a large scene see one or two per cent.
+_UNSEEN, _POINTS = 0.005, 512
 #: The mesh may be turned about its own centre if that is so many of its diagonals from the origin.
 _OFF_ORIGIN = 0.02
 #: Relative jump of inverse depth, and jump of normals, that are a whole edge.

@@ -29,8 +29,9 @@ class Shot:
     @staticmethod
     def of(cameras: Mapping[str, Camera], parts: Sequence[Part]) -> Shot:
         """These cameras of these parts; evenly chosen ones where they are many."""
-        step = max(1, -(-len(cameras) // MOST))
-        chosen = dict([*cameras.items()][::step])
+        names = [*cameras]
+        places = np.linspace(0, len(names) - 1, min(len(names), MOST)).round().astype(int)
+        chosen = {names[i]: cameras[names[i]] for i in places.tolist()}
         ends = [camera.origin for camera in chosen.values()]
         for positions in (part.triangles.positions for part in parts):
             ends += [positions.min(0), positions.max(0)]

@@ -197,7 +197,12 @@ def _require_sound(run: Path, out: Path, formats: Collection[str], wanted: _Want
     numbers = {"--texels": wanted.texels, "--metres-per-unit": wanted.metres}
     for option, number in numbers.items():
         if number is not None and not 1e-9 < number < 1e9:
-            wrong.append(UserError(f"must be a number from 1e-9 to 1e9, not {number:g}", option))
+            wrong.append(UserError(f"must be between 1e-9 and 1e9, not {number:g}", option))
+    if formats and not {"gltf", "usd"} & {*formats} and not unknown:
+        useless = {"--metres-per-unit": wanted.metres != 1, "--no-cameras": not wanted.cameras}
+        for option in (option for option, given in useless.items() if given):
+            what = "is for gltf and usd, and neither is written"
+            wrong.append(UserError(what, option, "Leave it out"))
     if wanted.most not in _SIZES:
         what = f"must be one of {', '.join(map(str, _SIZES))}, not {wanted.most}"
         wrong.append(UserError(what, "--max-texture"))

@@ -33,7 +33,7 @@ from .bake import Baked
 from .cameras import NO_SHOT, Shot
 from .constants import CUTOFF, Constants, constant_opacity, is_number, material_constants
 from .lights import Light
-from .parts import Part
+from .parts import Part, unique_names
 from .tessellate import Triangles
 from .textures import base_colour, picture
 from .upright import Up
@@ -411,9 +411,14 @@ def _add_light(document: Document, light: Light, metres: float) -> None:
 
 
 def _add_cameras(document: Document, shot: Shot, metres: float) -> None:
-    """Cameras of glTF look along -z, as those of a data set; a node has all of them."""
-    children = []
-    for name, camera in shot.cameras.items():
+    """Cameras of glTF look along -z, as those of a data set; a node has all of them.
+
+    No two nodes have one name: programs mix them up, as trimesh does.
+    """
+    children, others = [], [node["name"] for node in document.json.get("nodes", ())]
+    own = unique_names([*others, *(f"camera {name}" for name in shot.cameras), "cameras"])
+    *nodes, group = own[len(others) :]
+    for (name, camera), called in zip(shot.cameras.items(), nodes, strict=True):
         wide, high = camera.width / camera.fl_x, camera.height / camera.fl_y
         perspective = {
             "aspectRatio": wide / high,
@@ -423,9 +428,9 @@ def _add_cameras(document: Document, shot: Shot, metres: float) -> None:
         }
         made = {"name": name, "type": "perspective", "perspective": perspective}
         number, matrix = document.add("cameras", made), _unscaled(camera.to_world, metres)
-        node = {"name": name, "camera": number, "matrix": matrix}
+        node = {"name": called, "camera": number, "matrix": matrix}
         children.append(document.add("nodes", node))
-    top = document.add("nodes", {"name": "cameras", "children": children})
+    top = document.add("nodes", {"name": group, "children": children})
     document.json["scenes"][0]["nodes"].append(top)
 
 

@@ -174,7 +174,7 @@ def _atlas(name: str, parts: list[Part], texels: float, most: int) -> Atlas:
             corners = [_askew(uv) for uv in corners]
         placed = [_split(part, uv) for part, uv in zip(parts, corners, strict=True)]
         share = unique_share(placed)
-        # Coordinates are shares of the page: fewer texels than it has are only less dense.
+        # Coordinates are shares of the page. With fewer texels than it has, charts are nearer.
         size = min(size, most)
         found.append(Atlas(name, materials, placed, method, share, size, wanted, most))
         if share >= UNIQUE:
@@ -307,7 +307,8 @@ def _by_uvunwrap(meshes: list[Triangles], resolution: int) -> tuple[list[np.ndar
         return _checked(found, meshes)
 
     size, largest = resolution, min(_LARGER * resolution, LARGEST)
-    wide = packed(size, max(_PADDING, int(_APART * size)))
+    padding = int(_APART * size)
+    wide = packed(size, padding) if padding > _PADDING else "it would be no wider"
     if not isinstance(wide, str) and _filled_by(wide) >= _FILLED:
         return wide, size
     while isinstance(close := packed(size, _PADDING), str) and 2 * size <= largest:

@@ -144,9 +144,16 @@ def _level_axis(scene: mi.Scene) -> int:
     return int(np.argmax(np.abs(up_axis(scene))))
 
 
-def ground_beside_y(scene: mi.Scene) -> bool:
-    """Whether no sensor tells up, and all stands on a ground that is not level where y is up."""
-    return not _with_rays(scene) and _level_axis(scene) != 1
+def up_of_ground(scene: mi.Scene) -> str | None:
+    """The axis, such as +z, that is up if all stands on a ground, where no sensor tells it.
+
+    None: a sensor does, it is +y, or there is no ground.
+    """
+    if _with_rays(scene):
+        return None
+    ways = ((axis, sign) for axis, sign in _WAYS_UP if _has_ground(scene, axis, sign))
+    axis, sign = next(ways, (1, 1.0))
+    return None if (axis, sign) == (1, 1.0) else f"{'+' if sign > 0 else '-'}{'xyz'[axis]}"
 
 
 def _has_ground(scene: mi.Scene, axis: int, sign: float) -> bool:

@@ -35,6 +35,8 @@ _SURELY = 4
 #: Parts of a fit: until the first one is done, the mean albedo has its first weight, and from the
 #: second one on, its last.
 _HELD, _FREE = 0.1, 0.5
+#: The last weight over the first one, at least: it falls evenly in its logarithm.
+_LEAST_WEIGHT = 1e-6
 
 
 def is_shared(problem: Problem) -> bool:
@@ -105,7 +107,8 @@ def weigh_convention(problem: Problem, config: FitConfig, done: float) -> None:
     """
     if not config.shares_scale:
         return
-    first, last = config.lighting.anchor, config.lighting.final_anchor
+    first = config.lighting.anchor
+    last = min(first, max(config.lighting.final_anchor, _LEAST_WEIGHT * first))
     part = min(1.0, max(0.0, (done - _HELD) / (_FREE - _HELD)))
     problem.anchor = first ** (1 - part) * last**part
 
