@@ -86,21 +86,29 @@ def test_the_strength_of_a_lamp_is_found(photographs, method):
     assert light.emission_error < 0.05
 
 
-def test_a_lamp_in_view_and_materials_are_found_together(tmp_path):
-    """As bright as it is: what photographs show of it tells the scale."""
-    (tmp_path / "scene.xml").write_text(
-        """<scene version="3.0.0"><sensor type="perspective">
+def closed_room(folder, lamp):
+    """Photographs of a room of one colour, (0.2, 0.3, 0.1), with this lamp in it."""
+    (folder / "scene.xml").write_text(
+        f"""<scene version="3.0.0"><sensor type="perspective">
           <float name="fov" value="70"/><transform name="to_world">
             <lookat origin="0.5,-2.5,0.5" target="0,0,0" up="0,0,1"/></transform></sensor>
           <shape type="cube"><transform name="to_world"><scale value="3"/></transform>
             <boolean name="flip_normals" value="true"/>
             <bsdf type="principled"><rgb name="base_color" value="0.2, 0.3, 0.1"/></bsdf></shape>
-          <shape type="sphere" id="lamp"><point name="center" value="0,1,0"/>
-            <float name="radius" value="0.7"/>
-            <emitter type="area"><rgb name="radiance" value="2, 3, 1"/></emitter></shape></scene>"""
+          {lamp}</scene>"""
     )
     small = CaptureSettings(views=4, held_out=1, resolution=24, spp=64, max_depth=8)
-    dataset = capture(tmp_path / "scene.xml", tmp_path / "data", small, tell=lambda line: None)
+    return capture(folder / "scene.xml", folder / "data", small, tell=lambda line: None)
+
+
+def test_a_lamp_in_view_and_materials_are_found_together(tmp_path):
+    """As bright as it is: what photographs show of it tells the scale."""
+    dataset = closed_room(
+        tmp_path,
+        """<shape type="sphere" id="lamp"><point name="center" value="0,1,0"/>
+            <float name="radius" value="0.7"/>
+            <emitter type="area"><rgb name="radiance" value="2, 3, 1"/></emitter></shape>""",
+    )
     problem, _ = fitted(dataset, "materials+emission", steps=400)
     (light,) = recovered_emitters(problem, dataset.folder)
     found = mean_albedo(problem, dataset)
@@ -189,18 +197,11 @@ def test_the_mean_albedo_is_the_convention_where_nothing_else_tells_it(photograp
 
 def test_light_between_surfaces_tells_of_the_scale_that_begins_at_a_convention(tmp_path):
     """Of a closed room whose lamp no photograph shows."""
-    (tmp_path / "scene.xml").write_text(
-        """<scene version="3.0.0"><sensor type="perspective">
-          <float name="fov" value="70"/><transform name="to_world">
-            <lookat origin="0.5,-2.5,0.5" target="0,0,0" up="0,0,1"/></transform></sensor>
-          <shape type="cube"><transform name="to_world"><scale value="3"/></transform>
-            <boolean name="flip_normals" value="true"/>
-            <bsdf type="principled"><rgb name="base_color" value="0.2, 0.3, 0.1"/></bsdf></shape>
-          <emitter type="point" id="lamp"><point name="position" value="0,1,1"/>
-            <rgb name="intensity" value="4"/></emitter></scene>"""
+    dataset = closed_room(
+        tmp_path,
+        """<emitter type="point" id="lamp"><point name="position" value="0,1,1"/>
+            <rgb name="intensity" value="4"/></emitter>""",
     )
-    small = CaptureSettings(views=4, held_out=1, resolution=24, spp=64, max_depth=8)
-    dataset = capture(tmp_path / "scene.xml", tmp_path / "data", small, tell=lambda line: None)
     errors = {}
     for final_anchor in (1.0, 0.003):
         lighting = dataclasses.replace(FAST, final_anchor=final_anchor)

@@ -125,7 +125,7 @@ def export(
     out: Out,
     format: Formats = exports.DEFAULT_FORMATS,
     texels: Annotated[float | None, arg(metavar="TEXELS", help_behavior_hint="")] = None,
-    max_texture: Annotated[int, arg(metavar="TEXELS")] = 8192,
+    max_texture: Annotated[int, arg(metavar="TEXELS")] = exports.LARGEST_TEXTURE,
     metres_per_unit: Annotated[float, arg(metavar="METRES")] = 1.0,
     cameras: Flag = True,
     allow_outside: Flag = False,

@@ -206,9 +206,11 @@ def _that_see_more(
         own: these.
         tried: others.
     """
-    (least,) = _surface_seen(scene, cameras, [own])
     alike = [other for other in tried if other.score > max(LEAST, own.score - _ALIKE)]
-    if least >= _UNSEEN or not alike:
+    if not alike:
+        return []
+    (least,) = _surface_seen(scene, cameras, [own])
+    if least >= _UNSEEN:
         return []
     shares = _surface_seen(scene, cameras, alike)
     most = max(shares)

@@ -313,6 +313,13 @@ def spread_rays(cameras: Sequence[Camera], along: int) -> tuple[np.ndarray, np.n
     return np.concatenate(origins), np.concatenate(directions)
 
 
+def rotation_of(quaternion: np.ndarray) -> np.ndarray:
+    """The matrix (3, 3) of a unit quaternion (4,), as x, y, z, w."""
+    x, y, z, w = quaternion
+    across = np.array([(0, -z, y), (z, 0, -x), (-y, x, 0)])
+    return np.eye(3) + 2 * w * across + 2 * across @ across
+
+
 def up_of(cameras: Sequence[Camera]) -> np.ndarray:
     """The upward direction (3,), a unit vector, of photographs that were taken level.
 

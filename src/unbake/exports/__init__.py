@@ -8,3 +8,5 @@ EXPORT_FORMAT = 1
 Format = Literal["gltf", "textures", "mitsuba", "usd"]
 FORMATS: tuple[Format, ...] = get_args(Format)
 DEFAULT_FORMATS: tuple[Format, ...] = ("gltf", "textures")
+#: Texels along an edge of a texture, at most.
+LARGEST_TEXTURE = 8192

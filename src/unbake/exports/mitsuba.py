@@ -6,6 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -399,27 +400,26 @@ def _require_sensor(scene: ParsedScene, camera: Camera) -> list[str]:
         mean = (camera.fl_x + camera.fl_y) / 2
         camera = replace(camera, fl_x=mean, fl_y=mean)
     wanted = camera.sensor(_SPP)
-    sampler = mi.parser.SceneNode()
-    sampler.type = mi.ObjectType.Sampler
-    film = mi.parser.SceneNode()
-    film.type = mi.ObjectType.Film
-    film.props.set_plugin_name("hdrfilm")
-    film.props["width"], film.props["height"] = camera.width, camera.height
-    sensor = mi.parser.SceneNode()
-    sensor.type = mi.ObjectType.Sensor
-    sensor.props.set_plugin_name("perspective")
-    for key, value in wanted.items():
-        if key not in ("type", "film", "sampler"):
-            sensor.props[key] = value
-    for key, value in wanted["sampler"].items():
-        if key == "type":
-            sampler.props.set_plugin_name(value)
-        else:
-            sampler.props[key] = value
+    sampler = _node(mi.ObjectType.Sampler, wanted.pop("sampler"))
+    size = {"width": camera.width, "height": camera.height}
+    film = _node(mi.ObjectType.Film, {"type": "hdrfilm"} | size)
+    del wanted["film"]
+    sensor = _node(mi.ObjectType.Sensor, wanted)
     sensor.props["film"] = mi.Properties.ResolvedReference(scene.append(film))
     sensor.props["sampler"] = mi.Properties.ResolvedReference(scene.append(sampler))
     scene.append_to_root("exported sensor", sensor)
     return notes
+
+
+def _node(kind: mi.ObjectType, wanted: Mapping[str, Any]) -> mi.parser.SceneNode:
+    """A node of a scene with the plugin and the properties of a dictionary."""
+    node = mi.parser.SceneNode()
+    node.type = kind
+    node.props.set_plugin_name(wanted["type"])
+    for key, value in wanted.items():
+        if key != "type":
+            node.props[key] = value
+    return node
 
 
 def _require_integrator(scene: ParsedScene, plugin: str) -> None:

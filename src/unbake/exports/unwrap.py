@@ -14,12 +14,13 @@ from ..scene.bumps import turned
 from ..scene.parse import ParsedScene
 from ..scene.transforms import chosen_id
 from ..scene.triangles import mesh_of, numbered, triangle_areas
+from . import LARGEST_TEXTURE
 from .constants import FRACTIONS, constant_opacity
 from .parts import Part, unique_names
 from .tessellate import Triangles
 
 #: Texels along the edge of a texture.
-SMALLEST, LARGEST = 64, 8192
+SMALLEST, LARGEST = 64, LARGEST_TEXTURE
 #: Points by which texture coordinates are tried, and the share that must find back.
 POINTS, UNIQUE = 20_000, 0.999
 #: By how much the page of uvunwrap may grow until charts fit into it.
@@ -308,14 +309,14 @@ def _by_uvunwrap(meshes: list[Triangles], resolution: int) -> tuple[list[np.ndar
 
     size, largest = resolution, min(_LARGER * resolution, LARGEST)
     padding = int(_APART * size)
-    wide = packed(size, padding) if padding > _PADDING else "it would be no wider"
-    if not isinstance(wide, str) and _filled_by(wide) >= _FILLED:
+    wide = packed(size, padding) if padding > _PADDING else None
+    if isinstance(wide, list) and _filled_by(wide) >= _FILLED:
         return wide, size
     while isinstance(close := packed(size, _PADDING), str) and 2 * size <= largest:
         size *= 2
     if isinstance(close, str):
         raise RuntimeError(close)
-    if not isinstance(wide, str) and _filled_by(wide) >= _WORTH * _filled_by(close):
+    if isinstance(wide, list) and _filled_by(wide) >= _WORTH * _filled_by(close):
         return wide, resolution
     return close, size
 

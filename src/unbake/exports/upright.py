@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..dataset.camera import Camera, up_of
+from ..dataset.camera import Camera, rotation_of, up_of
 
 #: Degrees between up by the cameras and an axis of the scene that is taken as up all the same.
 _LEVEL = 10.0
@@ -47,9 +47,7 @@ class Up:
 
     def rotation(self, axis: str) -> np.ndarray:
         """The same turn as a matrix (3, 3)."""
-        x, y, z, w = self.quaternion(axis)
-        across = np.array([(0, -z, y), (z, 0, -x), (-y, x, 0)])
-        return np.eye(3) + 2 * w * across + 2 * across @ across
+        return rotation_of(self.quaternion(axis))
 
     def is_turned(self, axis: str) -> bool:
         """Whether up is another direction."""

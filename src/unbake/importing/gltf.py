@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..acquisition.new_light import axis_of
-from ..dataset.camera import Camera, up_of
+from ..dataset.camera import Camera, rotation_of, up_of
 from ..errors import UserError, named
 
 #: Suffixes of such files.
@@ -50,10 +50,13 @@ def turned_back(file: Path) -> np.ndarray | None:
     Returns:
         (4, 4); None: the file is of another kind, or nothing was turned or scaled.
     """
-    if not _is_own(file):
-        return None
+    top = _own_document(file)
+    return None if top is None else _back(top)
+
+
+def _back(top: Any) -> np.ndarray | None:
+    """The same, of what a file holds."""
     try:
-        top = _document(file)
         (root,) = top["scenes"][0]["nodes"]
         node = top["nodes"][root]
         x, y, z, w = (float(value) for value in node.get("rotation", (0, 0, 0, 1)))
@@ -64,11 +67,8 @@ def turned_back(file: Path) -> np.ndarray | None:
     sound = np.isfinite(length) and length > 0 and np.isfinite(scale) and scale > 0
     if node.get("name") != _UPRIGHT or not sound:
         return None
-    x, y, z, w = (-x / length, -y / length, -z / length, w / length)
-    across = np.array([(0, -z, y), (z, 0, -x), (-y, x, 0)])
     found = np.eye(4)
-    found[:3, :3] += 2 * w * across + 2 * across @ across
-    found[:3, :3] /= scale
+    found[:3, :3] = rotation_of(np.array((-x, -y, -z, w)) / length) / scale
     return None if np.array_equal(found, np.eye(4)) else found
 
 
@@ -85,13 +85,16 @@ def told_up(
     """
     if upright:
         return []
-    own = [str(file) for file in files if turned_back(file) is not None]
+    own, others = [], False
+    for file in (file for file in files if file.suffix.lower() in GLTF):
+        top = _own_document(file)
+        others |= top is None
+        own += [str(file)] if top is not None and _back(top) is not None else []
     notes = (
         [f"mesh: of an export of unbake, taken back to the axes and units there: {named(own)}"]
         if own
         else []
     )
-    others = any(file.suffix.lower() in GLTF and not _is_own(file) for file in files)
     if others and not moved and axis_of(up_of(cameras)) == "+z":
         notes.append(
             "GLB files have y up by their specification, and the cameras z: if the mesh lies on "
@@ -100,14 +103,15 @@ def told_up(
     return notes
 
 
-def _is_own(file: Path) -> bool:
-    """Whether `unbake export` wrote a file."""
+def _own_document(file: Path) -> Any:
+    """The JSON of a glTF file that `unbake export` wrote; None of any other file."""
     if file.suffix.lower() not in GLTF:
-        return False
+        return None
     try:
-        return str(_document(file)["asset"]["generator"]).startswith(_WRITER)
+        top = _document(file)
+        return top if str(top["asset"]["generator"]).startswith(_WRITER) else None
     except (OSError, ValueError, TypeError, LookupError, RecursionError):
-        return False
+        return None
 
 
 def _document(file: Path) -> Any:

@@ -137,11 +137,8 @@ def _level_axis(scene: mi.Scene) -> int:
     Imported scenes have no sensor, and many have z up: there it is the one along which all stands
     on something flat, y first.
     """
-    if not _with_rays(scene):
-        for axis, sign in _WAYS_UP:
-            if _has_ground(scene, axis, sign):
-                return axis
-    return int(np.argmax(np.abs(up_axis(scene))))
+    way = _way_of_ground(scene)
+    return int(np.argmax(np.abs(up_axis(scene)))) if way is None else way[0]
 
 
 def up_of_ground(scene: mi.Scene) -> str | None:
@@ -149,11 +146,19 @@ def up_of_ground(scene: mi.Scene) -> str | None:
 
     None: a sensor does, it is +y, or there is no ground.
     """
+    way = _way_of_ground(scene)
+    if way is None or way == (1, 1.0):
+        return None
+    axis, sign = way
+    return f"{'+' if sign > 0 else '-'}{'xyz'[axis]}"
+
+
+def _way_of_ground(scene: mi.Scene) -> tuple[int, float] | None:
+    """Up by a ground, axis and sign, the likeliest first; None where a sensor tells, or none."""
     if _with_rays(scene):
         return None
-    ways = ((axis, sign) for axis, sign in _WAYS_UP if _has_ground(scene, axis, sign))
-    axis, sign = next(ways, (1, 1.0))
-    return None if (axis, sign) == (1, 1.0) else f"{'+' if sign > 0 else '-'}{'xyz'[axis]}"
+    ways = (way for way in _WAYS_UP if _has_ground(scene, *way))
+    return next(ways, None)
 
 
 def _has_ground(scene: mi.Scene, axis: int, sign: float) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
@@ -89,19 +90,17 @@ def path_traced_halves(
         Pictures of each camera, linear RGB, float32, (H, W, 3).
     """
     rays, halves, spp = CameraRays.of(cameras), [], settings.reference_spp // 2
+    depths = {"max_depth": settings.max_depth, "rr_depth": settings.rr_depth}
     for half, part in enumerate(("first", "second")):
         seed = (2 * settings.seed + half) & 0x7FFFFFFF
         if scene_view.materials is None:
             sampler = mi.load_dict({"type": "independent", "sample_count": spp})
-            how = CaptureSettings(
-                max_depth=settings.max_depth, rr_depth=settings.rr_depth, seed=seed
-            )
+            how = replace(CaptureSettings(), **depths, seed=seed)
             rgb, _, _ = photographs(
                 scene_view.scene, rays, how, sampler, room,
                 lambda line, part=part: tell(f"{part} half: {line}"),
             )  # fmt: skip
         else:
-            depths = {"max_depth": settings.max_depth, "rr_depth": settings.rr_depth}
             paths = {**depths, "seed": seed, "hide_emitters": not room}
             rgb = render_radiance(scene_view, rays.through, rays.pixels, spp, **paths)
             tell(f"{part} half: rendered")

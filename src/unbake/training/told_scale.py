@@ -1,8 +1,8 @@
 """Whether photographs determine the scale of albedo and light, where both are unknown.
 
 They do where they show unknown light itself, directly or in mirrors and glass, and are not clipped:
-its radiance is then that of pixels. Where none shows any, the scale is a convention
-(`regularizers.py`).
+its radiance is then that of pixels. Where none shows any, the scale begins at a
+convention (`regularizers.py`), and light between surfaces tells more of it.
 """
 
 from __future__ import annotations
